@@ -20,7 +20,7 @@ from benchmarks.protocol import Row, read_protocols
 from benchmarks.study import Cell, finished
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
-from hqgs.training.gradients import Step
+from hqgs.training.forward import Step
 from hqgs.training.trainer import TrainingError
 
 RECORDS = 20  # in the course of a run

@@ -14,9 +14,9 @@ from hqgs.evaluation.held_out import HeldOutViews, held_out_means
 from hqgs.evaluation.metrics import haarpsi, psnr, ssim
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
+from hqgs.training.forward import Step
 from hqgs.training.frame import Frame
-from hqgs.training.gradients import Step
-from hqgs.training.pace import fit_to_seconds
+from hqgs.training.length import fit_to_seconds
 from hqgs.training.trainer import Trainer
 
 Run = dict[str, Any]  # plain JSON values

@@ -40,8 +40,8 @@ from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
 from hqgs.training.frame import Frame
+from hqgs.training.length import fit_to_seconds
 from hqgs.training.notes import learned_record, run_notes, run_pictures
-from hqgs.training.pace import fit_to_seconds
 from hqgs.training.plan import essential
 from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values, plan_values
@@ -313,7 +313,6 @@ def _report(
         "iterations": trainer.iteration,
         "length": trainer.length,
         "seconds": trainer.seconds,
-        "decision_seconds": trainer.frugality.memory.seconds,
         "gaussians": len(trainer.gaussians),
         "scene_bytes": None if out is None else (out / PLY).stat().st_size,
         "culled_in_a_view": sum(culled) / len(culled) if culled else None,

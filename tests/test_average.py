@@ -9,10 +9,10 @@ import pytest
 import torch
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.training.average import Average
 from hqgs.training.config import TrainConfig, run_config
 from hqgs.training.plan import Facts
 from hqgs.training.rules import plan_run
+from hqgs.training.state import Average
 from hqgs.training.trainer import Trainer
 
 ITERATIONS, COUNTED = 30, 6  # the last 30 % are the steps after 21; what grows until 25 is not counted in

@@ -19,11 +19,10 @@ from hqgs.base.files import CHECKPOINT, CONFIG, PLAN, PLY
 from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
-from hqgs.training import clock, rules
-from hqgs.training.checkpoint import load_checkpoint, save_checkpoint
+from hqgs.training import rules
 from hqgs.training.config import DensifyConfig, TrainConfig, run_config, with_iterations
+from hqgs.training.length import by_the_clock, fit_to_seconds
 from hqgs.training.notes import run_notes
-from hqgs.training.pace import fit_to_seconds
 from hqgs.training.plan import StepSeconds
 from hqgs.training.rules import FOR_EACH_PHOTO, GROWS_FROM, LEAST_ENOUGH, PIXELS
 from hqgs.training.schedule import Schedule
@@ -41,7 +40,7 @@ def turned_at(seconds: float, step: float, most: int = 10**6, **changes: Any) ->
     decisions, iteration = schedule.start(), 0
     while iteration < decisions.length:
         iteration += 1
-        decisions = clock.turned(schedule, decisions, iteration, iteration * step, step)
+        decisions = by_the_clock(schedule, decisions, iteration, iteration * step, step)
     assert schedule.part(iteration, decisions) == pytest.approx(1.0)
     assert schedule.densification_end(decisions) == STOP
     return decisions.turned, iteration
@@ -92,14 +91,9 @@ def test_a_resumed_run_of_seconds_knows_how_long_its_steps_take(tmp_path: Path) 
     for _ in range(3):
         trainer.step()
     trainer.save(tmp_path / CHECKPOINT)
-    tensors, meta = load_checkpoint(tmp_path / CHECKPOINT)
-    del meta["frugality"]["steps"]  # as checkpoints were
-    save_checkpoint(tmp_path / "old", tensors, meta)
     again = Trainer(tiny_scene(), trainer.asked)
-    for name, seconds in ((CHECKPOINT, trainer.frugality.step_seconds), ("old", 0.0)):
-        again.restore(tmp_path / name)
-        assert again.frugality.step_seconds == seconds
-    assert trainer.frugality.step_seconds > 0
+    again.restore(tmp_path / CHECKPOINT)
+    assert again.state.step_seconds == trainer.state.step_seconds > 0
 
 
 def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +191,7 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
     short = trainer()
     assert short.config.iterations == LEAST_ENOUGH == 4_000
     assert short.config.densify.stop == run_config(iterations=LEAST_ENOUGH).densify.stop
-    assert "iterations" not in short.schedule.items  # nothing is held back for it
+    assert "iterations" not in short.config.leave_out  # nothing is held back for it
     assert length in [item.what for item in short.left_out()]
     assert trainer(eval_every=123).config.eval_every == 123
     asked = trainer(iterations=9_000)
@@ -213,7 +207,7 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
         monkeypatch.setattr(f"hqgs.training.rules.{name}", 700)
     many = trainer()
     assert many.config.iterations == FOR_EACH_PHOTO * len(scene.train) == 1_050
-    assert "iterations" in many.schedule.items
+    assert "iterations" in many.config.leave_out
 
     def timed(seconds: float) -> Trainer:
         trainer = Trainer(scene, replace(run_config(formation="none"), seconds=seconds))

@@ -76,9 +76,9 @@ def test_a_coarse_beginning_has_coarser_limits() -> None:
     made = plans(timetable)
     assert [plan.coarse for plan in made] == [True] * 60 + [False] * 39
     assert [made[k].finest for k in (0, 59, 60)] == [2 * FINEST, 2 * FINEST, FINEST]
-    assert schedule_of(replace(config, iterations=9_000), [large] * 3).coarse_end == 1_500
+    assert schedule_of(replace(config, iterations=9_000), [large] * 3).run.half_size_until == 1_500
     degraded = schedule_of(config, [large] * 3, as_photographed=False)
-    assert degraded.items == frozenset()
+    assert degraded.config.leave_out == ()
     assert not any(plan.coarse or plan.finest for plan in plans(degraded))
 
 

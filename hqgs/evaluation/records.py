@@ -154,7 +154,6 @@ class RunRecord(TypedDict):
     iterations: int
     length: int  # iterations of the whole run; fewer were done where it was stopped
     seconds: float  # training time, without loading and without the report
-    decision_seconds: float  # of them: to find out what may be left out
     gaussians: int
     scene_bytes: int | None  # of scene.ply; None: nothing was written
     culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean

@@ -25,8 +25,10 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.training import checkpoint
 from hqgs.training.adam import Adam
 from hqgs.training.densify import Densifier, gradient_norms
-from hqgs.training.forward import ForwardPass
+from hqgs.training.forward import ForwardPass, Gradients, Step, TrainingViews
 from hqgs.training.guard import Fault
+from hqgs.training.schedule import StepPlan
+from hqgs.training.state import TrainState
 
 Answer = Callable[[], list[bytes]]
 WIDTHS = {"means": 3, "scales": 3, "quats": 4, "opacities": 1}  # of a row of the rest, in its order
@@ -102,6 +104,32 @@ class Rest:
     def unpacked(data: bytes) -> Rest:
         tensors = load(data)
         return Rest(tensors["values"], tensors.get("higher"), checkpoint.part("own.", tensors))
+
+
+def gradients_of_several(
+    plans: Sequence[StepPlan], training: TrainingViews, state: TrainState, ranks: Ranks
+) -> Gradients:
+    """Those of the views that a step takes, added up as rows, so that the bits do not depend on which
+    process rendered what."""
+    method, steps = training.method, list[Step]()
+
+    def make(k: int) -> tuple[Part, Callable[[], Rest]]:
+        shown = to_rasterize(state.gaussians, method.modulate(state.gaussians))
+        forward = training.at(plans[k], shown, state.densifier.seed)
+        fault = forward.backward(state)
+        steps.append(forward.step)
+        return part_of(forward, fault, state.gaussians, state.optimizer)
+
+    parts, others = exchanged(ranks, len(plans), make)
+    steps.append(Step(parts[0].loss, torch.zeros(0, 0, 3), training.views[plans[0].view]))
+
+    def apply() -> None:
+        with torch.no_grad():
+            modulated = method.modulate(state.gaussians)
+        rests = descend(parts, others, state.gaussians, modulated, state.optimizer)
+        note_views(parts, rests, [plan.observes for plan in plans], state.densifier)
+
+    return Gradients(steps[0], [part.fault for part in parts], [part.measured for part in parts], apply)
 
 
 def to_rasterize(trained: Gaussians, modulated: Gaussians) -> Gaussians:

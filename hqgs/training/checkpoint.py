@@ -19,7 +19,7 @@ from torch import Tensor
 from hqgs.base.files import atomic_path
 from hqgs.scene.scene import Scene
 
-FORMAT = 7  # raised when a newer reader could not use an older file
+FORMAT = 8  # raised when a newer reader could not use an older file
 FREE_FIELDS = ("eval_every", "checkpoint_every")  # may differ on resume: they do not change the result
 # In a longer run too.
 LENGTH_FIELDS = (

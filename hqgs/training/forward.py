@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +18,30 @@ from hqgs.model.rasterization import RasterizationMeta
 from hqgs.model.render import render_view
 from hqgs.photos.pixels import floats
 from hqgs.scene.scene import Camera, View
-from hqgs.training.adam import Adam
 from hqgs.training.guard import Fault, bad_values, coming_gradient, gradient_fault
 from hqgs.training.methods.base import Method, Target
+from hqgs.training.overfitting import with_dropout
 from hqgs.training.schedule import StepPlan, low_pass, smaller
+from hqgs.training.state import TrainState
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a training step has seen."""
+
+    loss: float  # of a view that this process has rendered
+    render: Tensor  # its developed render, [H, W, 3], detached; of size 0 where this process rendered none
+    view: View  # that view, of the size at which it was rendered; without one the step's first view
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Of the views of one step."""
+
+    step: Step
+    faults: list[Fault | None]  # what was not finite, of each view
+    measured: list[Tensor]  # what the method goes by after the step, of each view
+    apply: Callable[[], None]  # moves the Gaussians, and notes what growth goes by
 
 
 @dataclass(frozen=True)
@@ -38,16 +58,21 @@ class ForwardPass:
     measured: Tensor  # what the method goes by after the step, [K]
     pulls: list[Tensor]  # the gradient of the projected means, [1, N, 2], once it is there
 
-    def backward(self, trained: Gaussians, optimizer: Adam) -> Fault | None:
-        """Compute the gradients of all that is trained; what is not finite of them or of the loss, if
-        anything is."""
+    def backward(self, state: TrainState) -> Fault | None:
+        """Compute the gradients of all that is trained, in place of those that are there; what is not finite
+        of them or of the loss, if anything is."""
+        state.optimizer.zero_grad()
         if math.isfinite(self.loss.detach()):
             of_render = coming_gradient(self.render)
             self.loss.backward()
-            return gradient_fault(trained, optimizer, of_render)
+            return gradient_fault(state.gaussians, state.optimizer, of_render)
         count = bad_values(self.view)
-        none = torch.zeros(len(trained), dtype=torch.bool)
+        none = torch.zeros(len(state.gaussians), dtype=torch.bool)
         return Fault("photo" if count else "loss", [], none, count)
+
+    @property
+    def step(self) -> Step:
+        return Step(float(self.loss.detach()), self.photo.detach(), self.view)
 
 
 class TrainingViews:
@@ -73,9 +98,13 @@ class TrainingViews:
             self._small[number] = small, self.method.prepare(small)
         return self._small[number]
 
-    def at(self, plan: StepPlan, gaussians: Gaussians) -> ForwardPass:
-        """The forward pass that a plan asks for, of the Gaussians to rasterize, with a gradient history."""
+    def at(self, plan: StepPlan, gaussians: Gaussians, seed: int) -> ForwardPass:
+        """The forward pass that a plan asks for, of the Gaussians to rasterize, with a gradient history.
+
+        `seed`: of the run; it tells which Gaussians drop out.
+        """
         method, (view, target) = self.method, self.target(plan.view, plan.coarse)
+        gaussians = with_dropout(gaussians, plan.dropout, seed, plan.iteration)
         shot = method.shot(view, target)
         eps2d = low_pass(plan.coarse)
         render, meta = render_view(gaussians, shot.camera, plan.degree, self.background, eps2d)
@@ -108,3 +137,17 @@ class TrainingViews:
         if not errors:
             return math.nan
         return -10 * math.log10(max(float(np.mean(errors)) - self.method.noise**2, 1e-10))
+
+
+def gradients_of_one(plan: StepPlan, training: TrainingViews, state: TrainState) -> Gradients:
+    """Those of the view that a step takes; they stay where they came to be."""
+    forward = training.at(plan, training.method.modulate(state.gaussians), state.densifier.seed)
+    fault = forward.backward(state)
+
+    def apply() -> None:
+        if plan.observes:
+            (pulls,), radii, camera = forward.pulls[0], forward.meta["radii"][0], forward.view.camera
+            state.densifier.observe(pulls, radii, camera.width, camera.height)
+        state.optimizer.step()
+
+    return Gradients(forward.step, [fault], [forward.measured], apply)

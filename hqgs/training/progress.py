@@ -12,7 +12,7 @@ from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
-from hqgs.training.gradients import Step
+from hqgs.training.forward import Step
 from hqgs.training.trainer import Trainer
 
 

@@ -194,10 +194,7 @@ def budget(draft: Draft) -> None:
     facts, settings = draft.facts, draft.settings
     most = settings.densify.max_gaussians
     if not draft.formed or draft.undegraded or not facts.sizes:
-        # Few photos, which found their own cameras, are a little off: growth explains each photo alone,
-        # without end. The bound gained up to 1.1 dB on two captures; better cameras bear more (docs/log.md).
-        few = draft.formed and draft.kinds <= {"exposure"} and facts.found and facts.photos <= FEW_PHOTOS
-        if few and (bound := max(40 * facts.points, facts.pixels // 50)) < most:
+        if (bound := bound_of_few(draft)) < most:
             draft.grow(max_gaussians=bound)
             why = "more explain each photo alone: cameras found from so few are a little off"
             evidence = (
@@ -220,6 +217,18 @@ def budget(draft: Draft) -> None:
     draft.grow(max_gaussians=most, grad_threshold=threshold)
     if size := settings.hqgs.smallest:
         draft.note(f"{size:g} px of a photo", "what is finer, no photo has seen", what="smallest Gaussian")
+
+
+def bound_of_few(draft: Draft) -> int:
+    """How many Gaussians few photos bear that found their own cameras, which are a little off.
+
+    Growth then explains each photo alone, without end. Bounded so a museum of 8 and a wheel of 10 photos
+    gained up to 1.1 dB; better cameras bear more.
+    """
+    facts = draft.facts
+    few = draft.formed and draft.kinds <= {"exposure"} and facts.found and facts.photos <= FEW_PHOTOS
+    most = max(40 * facts.points, facts.pixels // 50)
+    return most if few else draft.settings.densify.max_gaussians
 
 
 def first_points(draft: Draft) -> None:
@@ -284,7 +293,7 @@ def length(draft: Draft) -> None:
 def _by_the_clock(draft: Draft, step: StepSeconds, seconds: float, most: int | None) -> None:
     """As many iterations as fit into the seconds, by the steps that were timed; `most` of them at most."""
     first = draft.plan.first_points / max(draft.facts.points, 1)
-    halves = _starts_small(draft)
+    halves = starts_small(draft)
     planned = fitting(seconds, step, first, halves, most)
     fits = planned != most
     why = f"as many as fit into {seconds:g} s" if fits else "more looks at the photos do not pay"
@@ -312,7 +321,7 @@ def fitting(seconds: float, step: StepSeconds, first: float, halves: bool, most:
 
 def half_size(draft: Draft) -> None:
     why = f"a scene takes shape at 1/{COARSE_FACTOR} of the sides"
-    small, items = _starts_small(draft), set(draft.settings.leave_out)
+    small, items = starts_small(draft), set(draft.settings.leave_out)
     items = items | {"resolution"} if small else items - {"resolution"}
     draft.set(leave_out=tuple(item for item in ITEMS if item in items))
     if small:
@@ -325,7 +334,7 @@ def half_size(draft: Draft) -> None:
         draft.note("full from the start", why)
 
 
-def _starts_small(draft: Draft) -> bool:
+def starts_small(draft: Draft) -> bool:
     """Whether the run starts at a part of the photos' sides: asked for, or photos as photographed from points
     all over them, of which Gaussians may be left out."""
     items, facts = draft.settings.leave_out, draft.facts

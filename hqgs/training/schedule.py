@@ -70,35 +70,30 @@ class Schedule:
     def config(self) -> TrainConfig:
         return self.run.settings
 
-    @property
-    def items(self) -> frozenset[str]:
-        """Of `ITEMS`: what this run does without."""
-        return frozenset(self.config.leave_out)
-
     def start(self) -> Decisions:
         """Before the first step."""
         return Decisions(self.config.iterations, released=0, turned=0)
 
     def plan(self, iteration: int, decisions: Decisions) -> StepPlan:
         """What step number `iteration` (1, 2, ...) does."""
-        densify, stop = self.config.densify, self.densification_end(decisions)
-        before = iteration - 1
-        smaller_part = self.is_coarse(iteration)
+        config, before = self.config, iteration - 1
+        densify, stop = config.densify, self.densification_end(decisions)
+        coarse, part = self.is_coarse(iteration), self.part(iteration, decisions)
+        finest = FINEST * (COARSE_FACTOR if coarse else 1) if "growth" in config.leave_out else None
         return StepPlan(
             iteration=iteration,
             # Not after the step that it is due at: what is looked at or written in between is the scene
             # before its opacities are cut, and a run that ends there keeps it.
             resets=0 < before < stop and before % densify.reset_every == 0,
             view=self.view(iteration, decisions),
-            coarse=smaller_part,
-            part=self.part(iteration, decisions),
+            coarse=coarse,
+            part=part,
             degree=self.degree(iteration),
-            dropout=(self.config.dropout or 0.0) * self.part(iteration, decisions),
+            dropout=(config.dropout or 0.0) * part,
             observes=iteration < stop,
             densifies=densify.start < iteration < stop and iteration % densify.every == 0,
-            finest=FINEST * (COARSE_FACTOR if smaller_part else 1) if "growth" in self.items else None,
-            averages=iteration >= stop
-            and self.part(iteration, decisions) > 1 - (self.config.averaged or 0.0),
+            finest=finest,
+            averages=iteration >= stop and part > 1 - (config.averaged or 0.0),
         )
 
     def batch(self, iteration: int, decisions: Decisions) -> list[StepPlan]:
@@ -118,9 +113,13 @@ class Schedule:
     def _pauses(self, plan: StepPlan, decisions: Decisions) -> bool:
         """Whether something is due, or may be decided, after this plan's view."""
         iteration, densification_end = plan.iteration, self.densification_end(decisions)
-        due = {decisions.length, densification_end, self.config.densify.stop, self.coarse_end}
+        due = {decisions.length, densification_end, self.config.densify.stop, self.run.half_size_until}
         due.add(self.turn_at(decisions))
-        return plan.densifies or iteration in due or ("iterations" in self.items and iteration % CHECKS == 0)
+        return (
+            plan.densifies
+            or iteration in due
+            or ("iterations" in self.config.leave_out and iteration % CHECKS == 0)
+        )
 
     def turn_at(self, decisions: Decisions) -> int:
         """The iteration after which the clock may give the run another length: some steps after growth, at
@@ -154,7 +153,7 @@ class Schedule:
     def degree(self, iteration: int) -> int:
         """Of the harmonics that are trained: it rises with the iterations."""
         interval = self.config.sh_interval
-        if "growth" in self.items and self.config.iterations > 3_000:
+        if "growth" in self.config.leave_out and self.config.iterations > 3_000:
             interval = min(interval, max(1, self.config.iterations // 20))
         return min(self.config.sh_degree, iteration // interval)
 
@@ -165,13 +164,9 @@ class Schedule:
             return stop
         return min(stop, math.ceil((1 + REST / 2) * decisions.released))
 
-    @property
-    def coarse_end(self) -> int:
-        """The last iteration at the smaller size; 0: there is none."""
-        return self.run.half_size_until
-
     def is_coarse(self, iteration: int) -> bool:
-        return iteration <= self.coarse_end
+        """Whether a step is at the smaller size."""
+        return iteration <= self.run.half_size_until
 
 
 def learning_rates(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,12 +15,42 @@ from hqgs.base.typed import build
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.adam import Adam
-from hqgs.training.average import Average
 from hqgs.training.checkpoint import part
 from hqgs.training.densify import Densifier
 from hqgs.training.guard import Guard
 from hqgs.training.plan import PlanRow
 from hqgs.training.schedule import Decisions
+
+
+@dataclass
+class Average:
+    """The mean of the Gaussians over the last steps of a run: what is shown and written at the end.
+
+    Each step serves one photo, and moves the scene a little away from the others; the mean over many steps
+    serves them all (Polyak and Juditsky 1992, SIAM J. Control Optim. 30(4)). It changes no step, and no row
+    comes or goes in between.
+    """
+
+    count: int = 0  # steps
+    means: dict[str, Tensor] = field(default_factory=dict)  # of each tensor of the Gaussians, by its name
+
+    @torch.no_grad()
+    def add(self, gaussians: Gaussians) -> None:
+        """Count them in as they are after a step."""
+        self.count += 1
+        for name, tensor in gaussians.named().items():
+            if self.count == 1:
+                self.means[name] = tensor.detach().clone()
+            else:
+                self.means[name].lerp_(tensor, 1 / self.count)
+
+    def clear(self) -> None:
+        """Forget all steps."""
+        self.count, self.means = 0, {}
+
+    def of(self, gaussians: Gaussians) -> Gaussians:
+        """The mean, or `gaussians` themselves where no step has been counted in."""
+        return gaussians.like(self.means) if self.count else gaussians
 
 
 @dataclass
@@ -36,6 +67,15 @@ class TrainState:
     guard: Guard = field(default_factory=Guard)
     history: list[HistoryEntry] = field(default_factory=list)  # of the held-out means
     rows: list[PlanRow] = field(default_factory=list)  # what was decided after the plan was made
+    refused: int = 0  # splits and clones of Gaussians that are too fine
+    best: float = -1e3  # dB, of the held-back photos
+    best_at: int = 0
+    recent: deque[float] = field(default_factory=lambda: deque(maxlen=50))  # seconds of the last steps
+
+    @property
+    def step_seconds(self) -> float:
+        """Of a view of a step now, the mean of the last ones; 0 before the first."""
+        return sum(self.recent) / len(self.recent) if self.recent else 0.0
 
     def none_left(self) -> str:
         """What is wrong where no Gaussian is left."""
@@ -65,6 +105,8 @@ class TrainState:
             "guard": asdict(self.guard),
             "decisions": asdict(self.decisions),
             "rows": [asdict(row) for row in self.rows],
+            "refused": self.refused,
+            "best": [self.best, self.best_at],
         }
 
     def restored(
@@ -117,6 +159,8 @@ class TrainState:
             Guard(**values["guard"]),
             values["history"],
             [PlanRow(**row) for row in values["rows"]],
+            values["refused"],
+            *values["best"],
         )
 
 

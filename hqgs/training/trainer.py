@@ -23,18 +23,18 @@ from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, reset_opacities
-from hqgs.training.clock import turned
+from hqgs.training.batch import gradients_of_several
 from hqgs.training.config import TrainConfig
-from hqgs.training.densify import Densification, Densifier
+from hqgs.training.densify import Densifier
+from hqgs.training.forward import Gradients, Step, gradients_of_one
 from hqgs.training.frame import Trainable
-from hqgs.training.frugality import Frugality
-from hqgs.training.gradients import Step, gradients_of
-from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, Fault, Guard, parameter_fault
+from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, Guard, parameter_fault
+from hqgs.training.length import by_held_photos, by_the_clock
 from hqgs.training.methods.base import Method
 from hqgs.training.overfitting import decay_opacities
 from hqgs.training.plan import PlanRow, RunPlan, Tried, left_out_of
 from hqgs.training.prepare import Prepared
-from hqgs.training.schedule import Decisions, Schedule, StepPlan, learning_rates, on_the_way
+from hqgs.training.schedule import FINEST, Decisions, Schedule, StepPlan, learning_rates, on_the_way
 from hqgs.training.settings import config_values
 from hqgs.training.state import TrainState
 
@@ -45,7 +45,7 @@ class TrainingError(RuntimeError):
 
 class Trainer:
     """A run: its schedule says what a step does, its state what it starts from, its method how a render is
-    judged, and its frugality what may be left out from then on."""
+    judged."""
 
     def __init__(
         self,
@@ -74,7 +74,6 @@ class Trainer:
     def _stand(self, plan: RunPlan) -> None:
         self.plan: RunPlan = plan
         self.schedule: Schedule = Schedule.of(plan, len(self.scene.train))
-        self.frugality: Frugality = Frugality(self.schedule, self.scene.train, self.shown, self._psnr)
         gaussians = self.prepared.first_gaussians(plan)
         self.first_points: int = len(gaussians)
         scene, settings = self.scene, plan.settings
@@ -131,34 +130,45 @@ class Trainer:
     def step(self, coarse: bool | None = None) -> Step:
         """Train on the next views (`Schedule.batch`). `coarse`: at the smaller size; None: as planned."""
         started = time.perf_counter()
-        state, method = self.state, self.method
-        plans = self.schedule.batch(self.iteration + 1, state.decisions)
+        state, views, config = self.state, self.prepared.training_views, self.config
+        plans = self.schedule.batch(state.iteration + 1, state.decisions)
         if coarse is not None:
             plans = [replace(plan, coarse=coarse) for plan in plans]
         if plans[0].resets:
-            reset_opacities(state.gaussians, state.optimizer, self.config.densify.reset_opacity)
+            reset_opacities(state.gaussians, state.optimizer, config.densify.reset_opacity)
         last = plans[-1]
         state.iteration = last.iteration
         self._set_rates(last)
 
         with one_torch_thread():
-            step, seen = self._train_on(plans)
-            densified = self._densify(last) if last.densifies else Densification()
-            self._cull(step.view, parameter_fault(state.gaussians, densified.parents is not None))
+            if config.batch == 1:
+                found = gradients_of_one(last, views, state)
+            else:
+                found = gradients_of_several(plans, views, state, self.ranks)
+            if self._sound([views.views[plan.view] for plan in plans], found):
+                found.apply()
+                # By rates that fell, a step gives less back: the same decay would make the whole scene fade.
+                if decay := self.method.rate_left * (config.opacity_decay or 0.0):
+                    decay_opacities(state.gaussians.opacities, 1 - (1 - decay) ** len(plans))
+            changed = last.densifies and self._densify(last)
+            if fault := parameter_fault(state.gaussians, changed):
+                state.guard.note(state.iteration, found.step.view, fault)
+                self._remove(fault.rows)
             if not len(state.gaussians):
                 raise TrainingError(state.none_left())
-            for plan, noted in zip(plans, seen, strict=True):
+            for plan, noted in zip(plans, found.measured, strict=True):
                 state.iteration = plan.iteration
-                method.after_step(
-                    state, self.prepared.training_views.target(plan.view, plan.coarse)[0], noted
-                )
-            self._leave_out(densified, (time.perf_counter() - started) / len(plans))
+                self.method.after_step(state, views.target(plan.view, plan.coarse)[0], noted)
+            state.recent.append((time.perf_counter() - started) / len(plans))
+            if self.schedule.holds(state.decisions):
+                state.decisions = by_held_photos(self.schedule, state, self._psnr_of_held)
             if last.averages:
                 state.average.add(state.gaussians)
 
         state.seconds += time.perf_counter() - started
-        state.decisions = self._turned()
-        return step
+        if self.plan.clock_most or config.turn:
+            self._look_at_the_clock()
+        return found.step
 
     def shown(self) -> Gaussians:
         """The Gaussians that are rasterized, without a gradient history; near the end the mean of steps."""
@@ -171,7 +181,11 @@ class Trainer:
 
     def left_out(self) -> list[LeftOut]:
         """What the run did without so far."""
-        return [*left_out_of(self.plan.rows), *self.frugality.left_out()]
+        found, refused = left_out_of(self.plan.rows), self.state.refused
+        if refused:
+            why = f"they were no wider than {FINEST:g} pixels of the sharpest photo, so no photo shows more"
+            found.append(LeftOut(f"{refused} splits of small Gaussians", why))
+        return found + left_out_of(self.state.rows)
 
     def held_out(self, numbers: Sequence[int] | None = None) -> HeldOutViews:
         """The held-out views of these numbers (None: all), for use before the next step."""
@@ -203,7 +217,7 @@ class Trainer:
         """Write the whole state as one checkpoint, atomically."""
         of_method = {f"method.{name}": tensor for name, tensor in self.method.state_dict().items()}
         meta = self.state.values() | {
-            "frugality": self.frugality.state_dict(),
+            "recent": list(self.state.recent) if self.plan.clock_most else [],
             "asked": config_values(self.asked),
             "plan": self.plan.values(),
             "tried": self.prepared.facts.tried and asdict(self.prepared.facts.tried),
@@ -239,10 +253,10 @@ class Trainer:
                 new = {name: getattr(self.config, name) for name in checkpoint.freed(meta["asked"], asked)}
                 self.begin(replace(saved, settings=replace(saved.settings, **new)))
             state = self.state.restored(path, tensors, meta, self._optimizer)
-            self.frugality.load_state_dict(meta["frugality"])
+            state.recent.extend(meta["recent"])
             if longer:
                 self.lengthened = done
-                self.frugality.forget_end()
+                state.rows = [replace(row, left_out=None) for row in state.rows]
                 state.average.clear()
                 why = "a longer run was asked for after its end"
                 state.rows.append(PlanRow("length", f"{more:,} iterations", why, "", "restore", done))
@@ -272,88 +286,64 @@ class Trainer:
             groups[name]["lr"] = rate
         groups["shN"]["used"] = (plan.degree + 1) ** 2 - 1
 
-    def _train_on(self, plans: Sequence[StepPlan]) -> tuple[Step, list[Tensor]]:
-        """Train on these views together; what the method goes by after the step, of each."""
-        state, training = self.state, self.prepared.training_views
-        found = gradients_of(plans, training, state, self.ranks, alone=self.config.batch == 1)
-        step = Step(found.loss, found.photo, found.view)
-        if self._sound([training.views[plan.view] for plan in plans], found.faults, step):
-            found.apply(state)
-            # By rates that fell, a step gives less back: the same decay would make the whole scene fade.
-            if decay := self.method.rate_left * (self.config.opacity_decay or 0.0):
-                decay_opacities(state.gaussians.opacities, 1 - (1 - decay) ** len(plans))
-        return step, found.measured
-
-    def _densify(self, plan: StepPlan) -> Densification:
-        """Add and remove Gaussians."""
+    def _densify(self, plan: StepPlan) -> bool:
+        """Add and remove Gaussians; whether there were any."""
         state, finest = self.state, None
         if plan.finest is not None:
             finest = (plan.finest * photo_pixels(state.gaussians.means, self.scene.train)).float()
         densified = state.densifier.update(plan.iteration, state.gaussians, state.optimizer, finest)
+        state.refused += densified.refused
         if densified.parents is not None:
             self.method.rows_changed(state, densified.parents)
-        return densified
+        return densified.parents is not None
 
-    def _leave_out(self, densified: Densification, seconds: float) -> None:
-        """Do without what the frugality finds to be of no use."""
+    def _remove(self, bad: Tensor) -> None:
+        """Remove the Gaussians that are not finite, bool [N], if there are any."""
         state = self.state
-        state.decisions = self.frugality.after_step(state, densified.refused, seconds)
+        if count := int(bad.sum()):
+            state.average.clear()
+            self.method.rows_changed(state, state.densifier.remove(bad, state.gaussians, state.optimizer))
+            state.guard.culled += count
 
-    def _remove(self, rows: Tensor) -> None:
-        """Remove the Gaussians of these rows, bool [N]."""
-        state = self.state
-        state.average.clear()
-        self.method.rows_changed(state, state.densifier.remove(rows, state.gaussians, state.optimizer))
-
-    def _turned(self) -> Decisions:
-        """The decisions after a step, by the clock of the first rank."""
-        state, before = self.state, self.state.decisions
-        step = self.frugality.step_seconds
-        decisions = turned(self.schedule, before, state.iteration, state.seconds, step)
+    def _look_at_the_clock(self) -> None:
+        """Decide after a step, by the clock of the first rank, how long the run is."""
+        state, step = self.state, self.state.step_seconds
+        decisions = by_the_clock(self.schedule, state.decisions, state.iteration, state.seconds, step)
         if self.plan.clock_most and self.ranks.count > 1:
             decisions = Decisions(**self.ranks.tell(asdict(decisions))[0])
-        if decisions != before:
+        if decisions != state.decisions:
             why = "as recorded" if self.config.turn else f"what fits into {self.config.seconds:g} s"
             evidence = f"{state.seconds:.1f} s so far, {1e3 * step:.1f} ms a step"
             length = f"{decisions.length:,} iterations"
             state.rows.append(PlanRow("length", length, why, evidence, "clock", state.iteration))
-        return decisions
+        state.decisions = decisions
 
-    def _psnr(self, gaussians: Gaussians, numbers: Sequence[int]) -> float:
-        """Of training photos of these numbers as the method compares them, of `gaussians` to rasterize."""
+    def _psnr_of_held(self) -> float:
+        """Of the training photos that are held back, as the method compares them."""
         degree, coarse = self.schedule.degree(self.iteration), self.schedule.is_coarse(self.iteration)
-        return self.prepared.training_views.psnr(gaussians, numbers, degree, coarse, self.ranks)
+        numbers, views = self.schedule.held, self.prepared.training_views
+        return views.psnr(self.shown(), numbers, degree, coarse, self.ranks)
 
-    def _sound(self, views: Sequence[View], faults: Sequence[Fault | None], step: Step) -> bool:
+    def _sound(self, views: Sequence[View], found: Gradients) -> bool:
         """Whether the step has gradients to go by, of one view at least; the guard notes its faults.
 
         Gaussians whose gradient is not finite are removed, and then no row is where the others' gradients
         have it: the whole step is skipped.
         """
         state, guard = self.state, self.state.guard
-        found = [(view, fault) for view, fault in zip(views, faults, strict=True) if fault is not None]
-        for view, fault in found:
+        faults = [(view, fault) for view, fault in zip(views, found.faults, strict=True) if fault is not None]
+        for view, fault in faults:
             guard.note(state.iteration, view, fault)
-        bad = torch.stack([fault.rows for _, fault in found]).any(dim=0) if found else None
-        removes = bad is not None and bool(bad.any())
-        if bad is not None and removes:
+        skipped = len(faults)
+        if faults and (bad := torch.stack([fault.rows for _, fault in faults]).any(dim=0)).any():
             self._remove(bad)
-            guard.culled += int(bad.sum())
-        skipped = len(views) if removes else len(found)
+            skipped = len(views)
         guard.skipped += skipped
         guard.skipped_in_a_row = guard.skipped_in_a_row + 1 if skipped == len(views) else 0
         if guard.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise TrainingError(
                 f"the loss or a gradient was not finite in {guard.skipped_in_a_row} steps in a row, up to "
-                f"iteration {state.iteration}; the last loss is {step.loss}, of view {step.view.name!r}"
+                f"iteration {state.iteration}; the last loss is {found.step.loss}, of view "
+                f"{found.step.view.name!r}"
             )
         return skipped < len(views)
-
-    def _cull(self, view: View, fault: Fault | None) -> None:
-        """Note what was not finite, and remove the Gaussians at fault."""
-        if fault is None:
-            return
-        self.state.guard.note(self.state.iteration, view, fault)
-        if count := int(fault.rows.sum()):
-            self._remove(fault.rows)
-            self.state.guard.culled += count

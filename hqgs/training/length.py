@@ -1,0 +1,98 @@
+"""How long a run is, decided while it trains: as long as held-back photos gain, or as its seconds allow.
+
+A few training photos are held back at first, where it is not known how long a run pays: they tell whether it
+still improves. Then they come back, early enough that the scene can still grow where only they look. Test
+views are never looked at. The rest of a run that has so many seconds, after growth, is as long as the clock
+allows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from hqgs.training.plan import PlanRow, StepSeconds
+from hqgs.training.schedule import CHECKS, REST, Decisions, Schedule
+from hqgs.training.state import TrainState
+
+if TYPE_CHECKING:
+    from hqgs.training.trainer import Trainer
+
+# dB and iterations: the run has stopped improving where held-back photos gain no more in so many.
+BETTER, PATIENCE = 0.05, 2_000
+
+
+def by_held_photos(schedule: Schedule, state: TrainState, psnr: Callable[[], float]) -> Decisions:
+    """The decisions after a step: whether held-back photos end the run sooner, or come back.
+
+    `psnr`: of those photos now, dB; NaN where their masks leave nothing. Rows of the state tell it.
+    """
+    decisions, iteration, total = state.decisions, state.iteration, schedule.config.iterations
+    if iteration % CHECKS == 0 and not schedule.is_coarse(iteration) and not math.isnan(now := psnr()):
+        if now > state.best + BETTER:
+            state.best, state.best_at = now, iteration
+        if iteration - state.best_at >= PATIENCE:
+            length = min(total, math.ceil((1 + REST) * iteration))
+            decisions = replace(decisions, length=length, released=iteration)
+            why = "the held-back photos stopped improving"
+            told = f"best {state.best:.2f} dB at iteration {state.best_at}, {now:.2f} dB at {iteration}"
+            left = f"iterations {length + 1} to {total}"
+            row = PlanRow("length", f"{length:,} iterations", why, told, "iterations", iteration, left)
+            state.rows.append(row)
+    if iteration == schedule.config.densify.stop:
+        decisions = replace(decisions, released=iteration)
+    if decisions.released:
+        why = "early enough that the scene can grow where only they look"
+        state.rows.append(PlanRow("photos held back", "back", why, "", "held_photos", iteration))
+    return decisions
+
+
+def by_the_clock(
+    schedule: Schedule, decisions: Decisions, iteration: int, seconds: float, step: float
+) -> Decisions:
+    """The decisions after a step: at `Schedule.turn_at` the rest gets the length that the clock allows.
+
+    `seconds`: that the run has taken; `step`: those of a step now. Settings with a `turn` follow that in
+    place of the clock.
+    """
+    config = schedule.config
+    if decisions.turned:
+        return decisions
+    at, most = schedule.turn_at(decisions), schedule.run.clock_most
+    if config.turn is not None:
+        length = config.turn[1]
+    elif most and config.seconds is not None:
+        rest = config.iterations - at
+        left = (config.seconds - seconds) / step if step > 0 else rest
+        length = at + round(min(max(left, 0.1 * rest), 4.0 * rest))
+        length = min(length, most)
+    else:
+        return decisions
+    if iteration != at or not at < min(length, config.iterations) or length == decisions.length == most:
+        return decisions
+    return replace(decisions, length=length, turned=at)
+
+
+def fit_to_seconds(trainer: Trainer) -> None:
+    """Plan a run that has so many seconds anew, by the time that its first steps take, and let it begin.
+
+    Does nothing to a run without a number of seconds, or whose length is recorded. The trainer is a fresh
+    one; the steps leave nothing behind.
+    """
+    if trainer.asked.seconds is None or trainer.asked.turn is not None:
+        return
+    half = _timed(trainer, True) if trainer.plan.half_size_until else 0.0
+    half, full = trainer.ranks.tell([half, _timed(trainer, False)])[0]
+    trainer.begin(trainer.prepared.plan(StepSeconds(full, half)))
+
+
+def _timed(trainer: Trainer, half_size: bool) -> float:
+    """Mean seconds of a step's view at half or at full size."""
+    for _ in range(3):  # the first ones start threads and fill caches
+        trainer.step(half_size)
+    started, before = trainer.seconds, trainer.iteration
+    for _ in range(7):
+        trainer.step(half_size)
+    return (trainer.seconds - started) / (trainer.iteration - before)
