@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,7 @@ from hqgs.scene.formats.llff import hold_marker
 from hqgs.scene.known_points import with_points
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, View
-from hqgs.training.config import NONE, PAPER, HQGSConfig, TrainConfig, parse_leave_out
-from hqgs.training.methods.paper import VARIANTS
+from hqgs.training.config import NONE, TrainConfig, parse_leave_out
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -51,7 +50,6 @@ class Row:
     label: str
     method: str = "3dgs"
     leave_out: str = NONE  # as the command line has it
-    paper: Literal["", "V1", "V2", "V3", "V4", "V5", "V6", "V7"] = ""  # variant of the paper's method
     config: dict[str, Any] = field(default_factory=dict)  # further changes of the `TrainConfig`
 
     @property
@@ -61,9 +59,8 @@ class Row:
 
     def train_config(self, seed: int, iterations: int, changes: dict[str, Any] | None = None) -> TrainConfig:
         """The run, its schedule fitted to its length. `changes`: of the protocol, before those of the row."""
-        hqgs = HQGSConfig(guidance=PAPER, paper=VARIANTS[self.paper]) if self.paper else HQGSConfig()
         config = TrainConfig(
-            iterations=iterations, method=self.method, seed=seed, hqgs=hqgs,
+            iterations=iterations, method=self.method, seed=seed,
             leave_out=parse_leave_out(self.leave_out),
         ).scaled()  # fmt: skip
         config = build(TrainConfig, changes or {}, "the protocol's config", config)

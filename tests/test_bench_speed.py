@@ -65,7 +65,7 @@ def test_steps_of_hqgs_stand_beside_those_of_3dgs(quick: DataFrame) -> None:
     rows = part(quick, "formations")
     assert [r["case"] for r in rows] == [
         "3dgs, 500", "hqgs, blur", "hqgs, lowres:2", "hqgs, jpeg:10", "hqgs, blur+lowres:2+jpeg:10",
-        "hqgs, paper's V6", "hqgs, paper's V7",
+        "hqgs, paper",
     ]  # fmt: skip
     assert rows[0]["ratio"] == 1
     # Of pairs of steps, and of medians: on a machine that others use they are not the same.

@@ -28,7 +28,6 @@ from benchmarks.speed.timing import (
 )
 from benchmarks.speed.training import make_trainer, measure_memory, measure_steps, step_by_parts
 from hqgs.training.config import METHODS, PAPER, HQGSConfig, check_method
-from hqgs.training.methods.paper import VARIANTS
 from hqgs.training.trainer import Trainer
 
 DATA = read_toml(Path(__file__).with_name("speed.toml"))
@@ -76,9 +75,7 @@ class Speed:
     def formations(self) -> Rows:
         n, steps = self.config["step_gaussians"][0], DATA["steps"]
         options = {f"hqgs, {f}": HQGSConfig(formation=f) for f in steps["formations"]}
-        options |= {
-            f"hqgs, paper's {v}": HQGSConfig(guidance=PAPER, paper=VARIANTS[v]) for v in steps["variants"]
-        }
+        options["hqgs, paper"] = HQGSConfig(guidance=PAPER)
         trainers = {name: self._trainer(n, "hqgs", option) for name, option in options.items()}
         return self.step({f"3dgs, {n:,}": self._trainer(n, "3dgs")} | trainers)
 

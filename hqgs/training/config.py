@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any
 
 import tyro
 
@@ -31,7 +31,6 @@ AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
 LEFT = ("passersby", "weight")  # items of former versions, which configurations may still name
 STANDARD = "standard"
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
-Loss = Literal["l1", "l1+dssim", "l1+scs"]
 
 
 @dataclass(frozen=True)
@@ -137,68 +136,10 @@ class SRGSConfig:
 
 
 @dataclass(frozen=True)
-class ESFGConfig:
-    """The parts of ESFG, which the ablation switches, and its sizes."""
-
-    saf: bool = True  # semantic-aware feature, from the photos I
-    eaf: bool = True  # edge-aware feature, from the maps E
-    cross_attention: bool = True  # queries from the EAF, keys and values from the SAF
-    concat: bool = True  # put the EAF behind the SAF or the attention's result; without: see `ESFG.forward`
-    downscale: int = 2  # of I and E before the MLPs, in each direction: 1, 2 or 4
-    feature_size: int = 1000  # F, the rows of F'
-    lr: float = 1e-6  # of Adam
-
-    def __post_init__(self) -> None:
-        if not (self.saf or self.eaf):
-            raise ValueError("saf and eaf are both off, so there is no feature; leave the whole ESFG out")
-        for name in ("cross_attention", "concat"):
-            if getattr(self, name) and not (self.saf and self.eaf):
-                raise ValueError(f"{name} needs both saf and eaf, got saf={self.saf}, eaf={self.eaf}")
-        if self.downscale not in (1, 2, 4):
-            raise ValueError(f"downscale is {self.downscale}, wanted 1, 2 or 4")
-        if self.feature_size < 1 or (self.concat and self.feature_size % 2):
-            kind = "even number" if self.concat else "number"
-            raise ValueError(f"feature_size is {self.feature_size}, wanted a positive {kind}")
-        if not 0 < self.lr < math.inf:
-            raise ValueError(f"lr is {self.lr}, wanted a positive number")
-
-
-@dataclass(frozen=True)
-class PaperConfig:
-    """The method, or a part of it. `VARIANTS` has those of the paper's ablation.
-
-    The paper gives one row of figures, V1 (3DGS) to V7 (everything), for five parts. Read so that each
-    variant is a method and that V4 may be worse than V3, as it is there:
-
-    =======  ===  ===  ======  ==  ===========  ==========
-    variant  SAF  EAF  concat  CA  loss         F'
-    =======  ===  ===  ======  ==  ===========  ==========
-    V1                             L1 + D-SSIM  none: 3DGS
-    V2       x                     L1 + D-SSIM  SAF
-    V3            x                L1 + D-SSIM  EAF
-    V4       x    x                L1 + D-SSIM  SAF + EAF
-    V5       x    x    x           L1 + D-SSIM  [SAF; EAF]
-    V6       x    x    x       x   L1 + D-SSIM  [CA; EAF]
-    V7       x    x    x       x   L1 + 5 SCS   [CA; EAF]
-    =======  ===  ===  ======  ==  ===========  ==========
-
-    L1 + D-SSIM is 3DGS's, with the weights 0.8 and 0.2. The ablation of losses is V7 with each `loss`.
-    """
-
-    esfg: ESFGConfig | None = field(default_factory=ESFGConfig)  # None: the means are rasterized as they are
-    loss: Loss = "l1+scs"
-
-    def __post_init__(self) -> None:
-        if self.loss not in get_args(Loss):
-            raise ValueError(f"loss is {self.loss!r}, wanted one of {', '.join(get_args(Loss))}")
-
-
-@dataclass(frozen=True)
 class HQGSConfig:
     """What HQGS assumes and how it weighs its terms. ValueError for a value out of range."""
 
     guidance: str = FORMATION  # or "paper": `PaperHQGS` instead of everything below
-    paper: PaperConfig = field(default_factory=PaperConfig)
     formation: str = AUTO  # what happened to the photos, as `parse_formation` reads it; "auto": diagnosed
     jpeg_pixels: float = 0.2  # weight of the pixel loss beside the loss of the JPEG cells
     smallest: float = 0.5  # standard deviation of the smallest Gaussian, in photo pixels

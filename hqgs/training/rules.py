@@ -166,7 +166,7 @@ def loss(draft: Draft) -> None:
         value = f"{1 - texture:g} at the photos' own resolution, {texture:g} at full size"
         draft.note(value, "SRGS: each view ties finer pixels")
     elif settings.method == "hqgs" and not draft.formed:
-        draft.note(f"{settings.hqgs.paper.loss} of modulated Gaussians", "the published form was asked for")
+        draft.note("L1 + 5 SCS of modulated Gaussians", "the published form was asked for")
     elif "jpeg" in has:
         why = "a file says no more of a coefficient than the cell that it lies in"
         draft.note(f"distance to the JPEG's cells + {settings.hqgs.jpeg_pixels:g} L1", why)

@@ -36,8 +36,11 @@ def read_config(path: str | Path) -> TrainConfig:
 
 def config_of_values(values: Any, where: str) -> TrainConfig:
     """The configuration of JSON values, of `where`. ValueError that names the field."""
-    if isinstance(values, dict) and isinstance(items := values.get("leave_out"), list):
-        values = values | {"leave_out": [item for item in items if item not in LEFT]}
+    if isinstance(values, dict):  # of a former version too
+        if isinstance(items := values.get("leave_out"), list):
+            values = values | {"leave_out": [item for item in items if item not in LEFT]}
+        if isinstance(hqgs := values.get("hqgs"), dict):
+            values = values | {"hqgs": {name: value for name, value in hqgs.items() if name != "paper"}}
     return build(TrainConfig, values, where)
 
 

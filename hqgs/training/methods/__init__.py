@@ -17,7 +17,7 @@ from hqgs.training.methods.srgs import SRGS
 def make_hqgs(scene: Scene, config: TrainConfig, inspector: Inspector) -> Method[Any]:
     """HQGS with the guidance that the configuration names."""
     if config.hqgs.guidance == PAPER:
-        return PaperHQGS(scene, config.seed, config.hqgs.paper)
+        return PaperHQGS(scene, config.seed)
     return HQGS(scene, config.hqgs, inspector, config.seed)
 
 

@@ -14,10 +14,10 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.photos.edges import edge_aware_map
 from hqgs.photos.pixels import floats
 from hqgs.scene.scene import View
-from hqgs.training.config import ESFGConfig
 from hqgs.training.methods.base import photo_tensors
 
-ESFG_HIDDEN = 64  # units of the one hidden layer of an MLP; the paper names no size
+HIDDEN = 64  # units of the one hidden layer of an MLP; the paper names no size
+FEATURES = 1000  # F, the rows of F'
 XYZ = 3  # F' feeds the sigmoid directly, so every feature has one number for each coordinate
 
 
@@ -25,10 +25,9 @@ class ESFG(nn.Module):
     """The fused feature F' [F, 3] of all training photos, and the positions that it modulates.
 
     What the paper leaves open is settled so:
-    - Fixed size. I and E of each view are area-averaged by `downscale`, then each view's counted pixels, row
-      by row, into T runs, then the N T runs of all views into T tokens [T, 3]; T = F / 2 with `concat`, else
-      F. This works for any number of views of any sizes. Both steps are averages, so `downscale` changes the
-      tokens only a little. The tokens never change, which makes a training step cheap.
+    - Fixed size. I and E of each view are averaged over blocks of 2 x 2, then each view's counted pixels, row
+      by row, into F / 2 runs, then those of all views into F / 2 tokens [F / 2, 3]. This works for any number
+      of views of any sizes. The tokens never change, which makes a training step cheap.
     - The MLPs act on tokens: 3 -> 64 -> 3 with a ReLU, one for each branch.
     - Attention is over tokens, with one head and learned 3 x 3 projections for Q, K and V.
     - The frame. mu is taken relative to the mean of the training cameras' centres, to which COLMAP's own
@@ -41,52 +40,30 @@ class ESFG(nn.Module):
     edge_tokens: Tensor  # [T, 3], from E
     center: Tensor  # [3], world units
 
-    def __init__(self, views: Sequence[View], seed: int, config: ESFGConfig) -> None:
+    def __init__(self, views: Sequence[View], seed: int) -> None:
         """`views`: all training views. `seed`: of the initial weights.
 
         Raises ValueError if no pixel of any view counts.
         """
         super().__init__()
-        self.config = config
-        count = config.feature_size // 2 if config.concat else config.feature_size
         centers = np.mean([view.camera.center for view in views], axis=0)
         self.register_buffer("center", torch.from_numpy(centers).float(), persistent=False)
         with one_torch_thread():
-            for name, tokens in zip(("photo", "edge"), _tokens(views, count, config.downscale), strict=True):
+            for name, tokens in zip(("photo", "edge"), _tokens(views, FEATURES // 2), strict=True):
                 self.register_buffer(f"{name}_tokens", tokens, persistent=False)
-        if config.saf:
-            self.saf: nn.Sequential = nn.Sequential(
-                _linear(XYZ, ESFG_HIDDEN), nn.ReLU(), _linear(ESFG_HIDDEN, XYZ)
-            )
-        if config.eaf:
-            self.eaf: nn.Sequential = nn.Sequential(
-                _linear(XYZ, ESFG_HIDDEN), nn.ReLU(), _linear(ESFG_HIDDEN, XYZ)
-            )
-        if config.cross_attention:
-            self.query: nn.Linear = _linear(XYZ, XYZ, bias=False)
-            self.key: nn.Linear = _linear(XYZ, XYZ, bias=False)
-            self.value: nn.Linear = _linear(XYZ, XYZ, bias=False)
+        self.saf: nn.Sequential = nn.Sequential(_linear(XYZ, HIDDEN), nn.ReLU(), _linear(HIDDEN, XYZ))
+        self.eaf: nn.Sequential = nn.Sequential(_linear(XYZ, HIDDEN), nn.ReLU(), _linear(HIDDEN, XYZ))
+        self.query: nn.Linear = _linear(XYZ, XYZ, bias=False)
+        self.key: nn.Linear = _linear(XYZ, XYZ, bias=False)
+        self.value: nn.Linear = _linear(XYZ, XYZ, bias=False)
         self._initialise(seed)
 
     def forward(self) -> Tensor:
-        """F' [F, 3].
-
-        Both features without `concat` and `cross_attention` are added. With `cross_attention` alone its
-        result is F'.
-        """
-        c = self.config
-        if not c.saf:
-            return self.eaf(self.edge_tokens)
-        saf = self.saf(self.photo_tokens)
-        if not c.eaf:
-            return saf
-        eaf = self.eaf(self.edge_tokens)
-        if c.cross_attention:
-            q, k, v = self.query(eaf), self.key(saf), self.value(saf)
-            saf = functional.scaled_dot_product_attention(q[None, None], k[None, None], v[None, None])[0, 0]
-        if c.concat:
-            return torch.cat([saf, eaf])
-        return saf if c.cross_attention else saf + eaf
+        """F' [F, 3]: what the edges' feature attends to of the photos', and the edges' feature."""
+        saf, eaf = self.saf(self.photo_tokens), self.eaf(self.edge_tokens)
+        q, k, v = self.query(eaf), self.key(saf), self.value(saf)
+        attended = functional.scaled_dot_product_attention(q[None, None], k[None, None], v[None, None])[0, 0]
+        return torch.cat([attended, eaf])
 
     def modulate(self, means: Tensor, rows: Tensor) -> Tensor:
         """mu' = mu + sigmoid(F') (mu - center) for means [M, 3] that read the rows [M] of F'."""
@@ -111,13 +88,13 @@ class ESFG(nn.Module):
 
 
 @torch.no_grad()
-def _tokens(views: Sequence[View], count: int, downscale: int) -> tuple[Tensor, Tensor]:
+def _tokens(views: Sequence[View], count: int) -> tuple[Tensor, Tensor]:
     """The photos I and their maps E as `count` tokens each, [count, 3]; see `ESFG`."""
     runs: tuple[list[Tensor], list[Tensor]] = ([], [])
     for view in views:
         photo, mask = photo_tensors(view)
         for image, found in zip((floats(photo), edge_aware_map(photo, mask)), runs, strict=True):
-            pixels = _downscaled(image, mask, downscale)
+            pixels = _downscaled(image, mask)
             if pixels.shape[1]:
                 found.append(functional.adaptive_avg_pool1d(pixels, count))
     if not runs[0]:
@@ -126,15 +103,15 @@ def _tokens(views: Sequence[View], count: int, downscale: int) -> tuple[Tensor, 
     return photo_tokens.contiguous(), edge_tokens.contiguous()
 
 
-def _downscaled(image: Tensor, mask: Tensor | None, factor: int) -> Tensor:
-    """Counted pixels [3, P] of an image [H, W, 3] after averaging blocks of factor x factor.
+def _downscaled(image: Tensor, mask: Tensor | None) -> Tensor:
+    """Counted pixels [3, P] of an image [H, W, 3] after averaging blocks of 2 x 2.
 
     A block at the border may be smaller. A block's mean is over its counted pixels; blocks without one are
     left out.
     """
     counted = torch.ones(image.shape[:2]) if mask is None else mask.float()
     planes = torch.cat([image.permute(2, 0, 1) * counted, counted[None]])
-    means = functional.avg_pool2d(planes, factor, ceil_mode=True).flatten(1)
+    means = functional.avg_pool2d(planes, 2, ceil_mode=True).flatten(1)
     means = means[:, means[3] > 0]
     return means[:3] / means[3]
 
