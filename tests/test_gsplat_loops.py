@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from scenes import random_scene
+from scenes import GaussianScene, random_scene
 from torch import Tensor
 
 import hqgs
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.gsplat_kernels import relocation
+from hqgs.model.meta import RasterizationMeta
 
 F32, F64 = torch.float32, torch.float64
 PER_SPLAT = ("means2d", "radii", "depths", "conics", "opacities")
@@ -59,6 +67,120 @@ def test_packed_gradients_and_absgrad_are_those_of_the_plain() -> None:
     assert torch.equal(means, plain_means)
     assert torch.equal(colors, plain_colors)
     assert torch.equal(absgrad, plain_absgrad[(radii > 0).all(-1)])
+
+
+def packed_scene() -> tuple[Tensor, RasterizationMeta, GaussianScene]:
+    scene = random_scene(60, 24, 17, 3, seed=1, dtype=F64).with_grad("means")
+    image, _, meta = hqgs.rasterization(**scene.arguments(packed=True))
+    return image, meta, scene
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [
+        dict,
+        lambda meta: {**meta},
+        lambda meta: dict(**meta),
+        lambda meta: dict(meta.items()),
+        lambda meta: dict(zip(meta.keys(), meta.values(), strict=True)),
+        lambda meta: {key: meta.get(key) for key in meta},
+        lambda meta: meta | {},
+        lambda meta: {} | meta,
+        lambda meta: meta.copy(),
+        copy.copy,
+        lambda meta: pickle.loads(pickle.dumps(meta)),
+        lambda meta: {key: meta.pop(key) for key in [*meta]},
+    ],
+)
+def test_packed_meta_data_are_a_dictionary(copied: Callable[[Any], dict[str, Any]]) -> None:
+    plain = hqgs.rasterization(**packed_scene()[2].arguments())[2]
+    seen, lazy = (plain["radii"] > 0).all(-1), packed_scene()[1]
+    assert (len(lazy), "radii" in lazy, "ids" in lazy) == (len(plain), True, False)
+    found = copied(lazy)
+    assert [*found] == [*plain]
+    for name in PER_SPLAT:
+        assert torch.equal(found[name], plain[name][seen]), name
+    assert torch.equal(torch.stack([found["camera_ids"], found["gaussian_ids"]], 1), seen.nonzero())
+    assert "torch" not in repr(found["width"])
+    assert "tensor" in repr(packed_scene()[1])
+
+
+@pytest.mark.parametrize("grad", ["retained", "hook", "asked for", "of the copy"])
+def test_the_gradient_of_the_positions_is_there_for_whoever_asks(grad: str) -> None:
+    image, meta, _ = packed_scene()
+    plain_image, _, plain = hqgs.rasterization(**packed_scene()[2].with_grad("means").arguments())
+    (wanted,) = torch.autograd.grad(plain_image.square().sum(), plain["means2d"])
+    found, loss = list[Tensor](), image.square().sum()
+    if grad == "asked for":
+        found += torch.autograd.grad(loss, meta["means2d"])
+    elif grad == "hook":
+        meta["means2d"].register_hook(found.append)
+        loss.backward()
+    else:
+        positions: Any = dict(meta)["means2d"] if grad == "of the copy" else meta["means2d"]
+        positions.retain_grad()
+        loss.backward()
+        found.append(positions.grad)
+    assert torch.equal(found[0], wanted[(plain["radii"] > 0).all(-1)])
+
+
+def test_meta_data_read_late_and_losses_on_them() -> None:
+    gradients = []
+    for late in (False, True):
+        image, meta, scene = packed_scene()
+        if late:
+            image.square().sum().backward(retain_graph=True)
+            with torch.no_grad():
+                depths = meta["depths"]
+            scene.means.grad = None
+        else:
+            depths = meta["depths"]
+        (image.square().sum() + depths.sum() + meta["means2d"].sum() + meta["conics"].sum()).backward()
+        gradients.append(scene.means.grad)
+    plain = packed_scene()[2].with_grad("means")
+    image, _, meta = hqgs.rasterization(**plain.arguments())
+    seen = (meta["radii"] > 0).all(-1)
+    losses = [meta[name][seen].sum() for name in ("depths", "means2d", "conics")]
+    (image.square().sum() + losses[0] + losses[1] + losses[2]).backward()
+    for gradient in gradients:
+        torch.testing.assert_close(gradient, plain.means.grad, rtol=1e-12, atol=1e-12)
+
+
+NO_THREADS_OF_TORCH = """
+import os, sys, torch, hqgs
+import numpy as np
+torch.set_num_threads(1)
+sys.path.insert(0, "tests")
+from scenes import GaussianScene, random_scene
+
+def threads():
+    return len(os.listdir("/proc/self/task"))
+
+scene = random_scene(40_000, 300, 200, 2, dtype=torch.float32).with_grad("means", "colors", "opacities")
+covars = torch.eye(3).repeat(40_000, 1, 1).mul_(1e-4).requires_grad_()
+modes = [{"render_mode": mode} for mode in ("D", "ED", "RGB+ED")]
+before = 1 << 20
+torch.set_num_threads(3)
+for options in [{"covars": covars}, {"covars": covars}, {}, {"absgrad": True}, *modes]:
+    image, alphas, meta = hqgs.rasterization(**scene.arguments(packed=True, **options))
+    [*meta.values()]
+    nothing = [torch.from_numpy(np.zeros(t.shape, np.float32)) for t in (image, alphas)]
+    torch.autograd.backward([image, alphas], nothing)
+    scene.means.grad = scene.colors.grad = scene.opacities.grad = covars.grad = None
+    assert threads() <= before, options
+    before = threads()  # after the first call those of the crate and of SciPy are there
+torch.zeros(1 << 20).exp()
+assert threads() > before  # what would be seen
+assert torch.get_num_threads() == 3
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no list of threads")
+def test_no_thread_of_torch_wakes_up() -> None:
+    """They spin for milliseconds after their work, on the cores of the crate's."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    command = [sys.executable, "-c", NO_THREADS_OF_TORCH]
+    subprocess.run(command, check=True, cwd=Path(__file__).parent.parent, env=environment, timeout=300)
 
 
 @pytest.mark.parametrize(("opacity", "count"), [(0.3, 2), (0.9, 7), (0.999, 51), (0.6, 1)])

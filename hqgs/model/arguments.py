@@ -137,7 +137,7 @@ def as_backgrounds(value: Tensor | Sequence[object], means: Tensor, batch: Seque
     """Backgrounds as [..., C, D] in the dtype of the means: also from a single colour, or from integers."""
     if not isinstance(value, Tensor):
         try:
-            value = torch.tensor(value, dtype=means.dtype)
+            value = torch.tensor(value, dtype=means.dtype, device="cpu")
         except (TypeError, ValueError, RuntimeError):
             raise ValueError(f"backgrounds: expected colours [C, D], or one, got {short(value)}") from None
     if not (value.is_floating_point() or value.is_complex() or value.dtype == torch.bool):

@@ -11,23 +11,23 @@ import torch
 from torch import Tensor
 
 from hqgs import _rust
+from hqgs.base.threads import one_torch_thread
+from hqgs.model.covariances import whole
+
+LEAST_ALPHA = 1e-10  # by which an expected depth is divided
 
 
-def _numpy(tensor: Tensor) -> np.ndarray[Any, Any]:
+def as_array(tensor: Tensor) -> np.ndarray[Any, Any]:
     """The tensor's memory as a C-contiguous array; copied only if it is not contiguous."""
     return tensor.detach().contiguous().numpy()
 
 
 def _optional(tensor: Tensor | None) -> np.ndarray[Any, Any] | None:
-    return None if tensor is None else _numpy(tensor)
+    return None if tensor is None else as_array(tensor)
 
 
 def _tensor(array: np.ndarray[Any, Any] | None, *shape: int) -> Tensor | None:
     return None if array is None else torch.from_numpy(array).view(shape)
-
-
-def _packed(tensor: Tensor | None, ids: tuple[Tensor, ...] | None) -> Tensor | None:
-    return tensor if tensor is None or ids is None else tensor[ids]
 
 
 class _First(torch.autograd.Function):
@@ -49,12 +49,15 @@ class _First(torch.autograd.Function):
         )
 
 
-def _once(backward: Callable[..., tuple[Tensor | None, ...]]) -> Callable[..., tuple[Tensor | None, ...]]:
+Gradients = tuple[Tensor | None, ...]
+
+
+def first_derivative(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:
     """A backward pass that is an error to differentiate."""
 
     @wraps(backward)
     def once(ctx: Any, *grads):
-        with torch.no_grad():
+        with one_torch_thread(), torch.no_grad():
             found = backward(ctx, *grads)
         if not torch.is_grad_enabled():  # it is where create_graph is
             return found
@@ -65,8 +68,8 @@ def _once(backward: Callable[..., tuple[Tensor | None, ...]]) -> Callable[..., t
 
 class _Project(torch.autograd.Function):
     """Gaussians to splats. `link` has no values of interest: its cotangent carries the gradient of the 2D
-    covariance in whitened form, which stays of order 1 however thin a Gaussian is. Nor have `covars`, [N, 6]
-    or None: they get the gradient of what `quats` and `scales` stand for."""
+    covariance in whitened form, which stays of order 1 however thin a Gaussian is. Nor have `covars`: they
+    get the gradient of what `quats` and `scales` stand for."""
 
     @staticmethod
     def forward(
@@ -76,9 +79,9 @@ class _Project(torch.autograd.Function):
         needs_means, *geometry, needs_harmonics, needs_rest, needs_viewmats = ctx.needs_input_grad[:8]
         colors_vary = needs_means or needs_viewmats or needs_harmonics or needs_rest
         others = (*options, enabled and colors_vary), sh_degree, activate
-        inputs = _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), _numpy(colors)
+        inputs = as_array(means), as_array(quats), as_array(scales), as_array(opacities), as_array(colors)
         frame, *arrays = _rust.project_forward(
-            *inputs, _optional(rest), _numpy(viewmats), _numpy(Ks), width, height, *others
+            *inputs, _optional(rest), as_array(viewmats), as_array(Ks), width, height, *others
         )
         n, c = means.shape[0], viewmats.shape[0]
         means2d, depths, conics, radii, alphas, sh_colors = map(torch.from_numpy, arrays)
@@ -100,7 +103,7 @@ class _Project(torch.autograd.Function):
         return frame, means2d, link, depths, conics, radii, alphas, sh_colors
 
     @staticmethod
-    @_once
+    @first_derivative
     def backward(ctx: Any, *grads):
         _, v_means2d, v_link, v_depths, v_conics, _, v_alphas, v_colors = grads
         means, quats, scales, opacities = ctx.saved_tensors
@@ -110,7 +113,7 @@ class _Project(torch.autograd.Function):
             v_colors = None
         *v_inputs, _ = _rust.project_backward(
             ctx.frame,
-            (_numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities)),
+            (as_array(means), as_array(quats), as_array(scales), as_array(opacities)),
             (
                 _optional(v_means2d),
                 _optional(v_link),
@@ -124,58 +127,90 @@ class _Project(torch.autograd.Function):
         if v_inputs[7] is not None:  # computed in f64; stay finite in the dtype of the inputs
             limit = torch.finfo(means.dtype).max
             v_inputs[7].clip(-limit, limit, out=v_inputs[7])
-        shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 6), *ctx.sh_shapes, (c, 4, 4)]
+        if v_inputs[4] is not None:
+            v_inputs[4] = whole(v_inputs[4].reshape(n, 6))
+        shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 3, 3), *ctx.sh_shapes, (c, 4, 4)]
         return (*(_tensor(v, *shape) for v, shape in zip(v_inputs, shapes, strict=True)), None, None, None)
 
 
 class _Composite(torch.autograd.Function):
-    """Splats to pixels. Of `means2d`, [C, N, 2], or [M, 2] of the pairs `ids` (cameras and Gaussians, [M]
-    each), no value is looked at, for the frame has them: it gets the gradient."""
+    """Splats to pixels. Of `means2d`, [C, N, 2], no value is looked at, for the frame has them: it gets the
+    gradient, or once the meta data are asked for them, `packed` does, [M, 2] of the pairs of `which`."""
 
     @staticmethod
-    def forward(ctx: Any, frame, means2d, link, alphas_in, colors, backgrounds, absgrad, ids):
-        channels = colors.shape[-1]
-        state, image, alphas = _rust.composite_forward(
-            frame, _numpy(colors), _optional(backgrounds), channels
-        )
-        c = link.shape[0]
-        width, height = frame.width, frame.height
-        image = torch.from_numpy(image).view(c, height, width, channels)
-        alphas = torch.from_numpy(alphas).view(c, height, width, 1)
-        ctx.state, ctx.absgrad, ctx.ids, ctx.splats = state, absgrad, ids, link.shape[:2]
-        ctx.save_for_backward(means2d, colors, backgrounds)
+    def forward(
+        ctx: Any, frame, means2d, packed, link, alphas_in, colors, depths, backgrounds, mode, absgrad, which
+    ):
+        c, n = link.shape[:2]
+        channels, behind = as_array(colors), _optional(backgrounds)
+        if mode != "RGB":
+            last = as_array(depths)[..., None]
+            channels = (
+                np.broadcast_to(channels, (c, n, channels.shape[-1])) if "RGB" in mode else last[..., :0]
+            )
+            channels = np.concatenate([channels, last], -1)
+            behind = None if behind is None or "RGB" not in mode else np.pad(behind, ((0, 0), (0, 1)))
+        state, image, alphas = _rust.composite_forward(frame, channels, behind, channels.shape[-1])
+        image = image.reshape(c, frame.height, frame.width, channels.shape[-1])
+        alphas = alphas.reshape(c, frame.height, frame.width, 1)
+        ctx.expected = None  # depth, with the alphas
+        if mode.endswith("ED"):
+            with np.errstate(all="ignore"):
+                image[..., -1:] /= np.maximum(alphas, LEAST_ALPHA)
+            ctx.expected = image[..., -1:].copy(), alphas.copy()
+        ctx.state, ctx.behind, ctx.mode, ctx.absgrad, ctx.which = state, behind, mode, absgrad, which
+        ctx.shape = c, n, channels.shape[-1]
+        ctx.save_for_backward(means2d if packed is None else packed, colors)
         ctx.image_shape = image.shape
         ctx.set_materialize_grads(False)
-        return image, alphas, state.work
+        return torch.from_numpy(image), torch.from_numpy(alphas), state.work
 
     @staticmethod
-    @_once
+    @first_derivative
     def backward(ctx: Any, *grads):
         v_image, v_alphas, _ = grads
-        means2d, colors, backgrounds = ctx.saved_tensors
-        _, need_means2d, need_link, need_alphas, need_colors, need_backgrounds, *_ = ctx.needs_input_grad
+        means2d, colors = ctx.saved_tensors
+        _, *needs = ctx.needs_input_grad[:8]
+        need_means2d, _, need_link, need_alphas, need_colors, need_depths, need_backgrounds = needs
         geometry = need_means2d or need_link or need_alphas
         if v_image is None and v_alphas is None:
-            return (None,) * 8
-        (c, n), channels = ctx.splats, colors.shape[-1]
-        v_image = means2d.new_zeros(ctx.image_shape) if v_image is None else v_image
-        wanted = [geometry, ctx.absgrad, need_colors, need_backgrounds]
-        *v_inputs, _ = _rust.composite_backward(
-            ctx.state, _optional(backgrounds), _numpy(v_image), _optional(v_alphas), wanted
-        )
+            return (None,) * 11
+        c, n, channels = ctx.shape
+        v_image = np.zeros(ctx.image_shape, as_array(means2d).dtype) if v_image is None else as_array(v_image)
+        v_alphas = _optional(v_alphas)
+        if ctx.expected is not None:
+            v_image, v_alphas = _of_accumulated(ctx.expected, v_image, v_alphas)
+        need_colors, need_depths = need_colors and "RGB" in ctx.mode, need_depths and ctx.mode != "RGB"
+        need_backgrounds = need_backgrounds and ctx.behind is not None
+        wanted = [geometry, ctx.absgrad, need_colors or need_depths, need_backgrounds]
+        *v_inputs, _ = _rust.composite_backward(ctx.state, ctx.behind, v_image, v_alphas, wanted)
         v_means2d, v_link, v_alphas_in, v_abs, v_colors, v_backgrounds = v_inputs
+        v_means2d, v_packed = _tensor(v_means2d, c, n, 2), None
+        v_abs = _tensor(v_abs, c, n, 2)
+        if ctx.which is not None and ctx.which.asked:
+            v_packed, v_means2d = ctx.which.of(v_means2d), None
+            v_abs = ctx.which.of(v_abs)
         if v_abs is not None:
-            means2d.absgrad = _packed(_tensor(v_abs, c, n, 2), ctx.ids)
-        v_color = _tensor(v_colors, c, n, channels)
+            means2d.absgrad = v_abs
+        v_color, v_depths = _tensor(v_colors, c, n, channels), None
+        v_background = _tensor(v_backgrounds, c, channels)
+        if v_background is not None and ctx.mode != "RGB":
+            v_background = v_background[:, :-1]
+        if v_color is not None and ctx.mode != "RGB":
+            v_depths = v_color[..., -1].contiguous() if need_depths else None
+            v_color = v_color[..., :-1].contiguous() if need_colors else None
         if v_color is not None and colors.dim() == 2:
             v_color = v_color[0] if c == 1 else v_color.sum(0)
-        return (
-            None,
-            _packed(_tensor(v_means2d, c, n, 2), ctx.ids),
-            _tensor(v_link, c, n, 3),
-            _tensor(v_alphas_in, c, n),
-            v_color,
-            _tensor(v_backgrounds, c, channels),
-            None,
-            None,
-        )
+        v_link, v_alphas_in = _tensor(v_link, c, n, 3), _tensor(v_alphas_in, c, n)
+        splats = None, v_means2d, v_packed, v_link, v_alphas_in
+        return *splats, v_color, v_depths, v_background, None, None, None
+
+
+def _of_accumulated(expected, v_image, v_alphas):
+    """Cotangents of the accumulated depth, the last channel, and of the alphas by which it was divided."""
+    depth, alphas = expected
+    over, last = np.maximum(alphas, LEAST_ALPHA), v_image[..., -1:]
+    with np.errstate(all="ignore"):
+        v_divisor = np.where(alphas >= LEAST_ALPHA, -last * (depth / over), 0)
+        v_image = np.concatenate([v_image[..., :-1], last / over], -1)
+        return v_image, v_divisor if v_alphas is None else v_alphas + v_divisor

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs.model.formats.turned import quaternions
@@ -11,11 +13,17 @@ from hqgs.model.formats.turned import quaternions
 UPPER = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 
-def upper_entries(covars: Tensor, means: Tensor) -> Tensor:
-    """The entries on and above the diagonal [..., N, 6] of covariances [..., N, 3, 3], as gsplat takes them.
+def quats_and_scales(covars: Tensor, means: Tensor) -> tuple[Tensor, Tensor]:
+    """Quaternions w x y z [..., N, 4] and standard deviations [..., N, 3] of covariances [..., N, 3, 3].
+
+    As for gsplat, the entries on and above the diagonal count.
+
+    They have no gradient: rotations have none where two scales are equal. Eigenvalues and eigenvectors in
+    float64, rounded to the dtype of the covariances; eigenvalues below 0 are 0. Where a covariance is not
+    finite, neither are the scales, so that the Gaussian is culled.
 
     Raises:
-        ValueError: another type, dtype or shape.
+        ValueError: another type, dtype or shape than that of the `means`.
     """
     if not isinstance(covars, Tensor):
         raise ValueError(f"covars: expected a torch tensor, got {covars!r:.60}")
@@ -24,17 +32,7 @@ def upper_entries(covars: Tensor, means: Tensor) -> Tensor:
     if covars.shape != (*means.shape[:-1], 3, 3):
         wanted = [*means.shape[:-1], 3, 3]
         raise ValueError(f"covars: expected shape {wanted}, got {list(covars.shape)}")
-    return covars[..., UPPER[0], UPPER[1]]
-
-
-def quats_and_scales(upper: Tensor) -> tuple[Tensor, Tensor]:
-    """Quaternions w x y z [..., N, 4] and standard deviations [..., N, 3] of covariances by `upper_entries`.
-
-    They have no gradient: rotations have none where two scales are equal. Eigenvalues and eigenvectors in
-    float64, rounded to the dtype of the covariances; eigenvalues below 0 are 0. Where a covariance is not
-    finite, neither are the scales, so that the Gaussian is culled.
-    """
-    entries = upper.detach().double()
+    entries = covars.detach().double()[..., UPPER[0], UPPER[1]]
     finite = entries.isfinite().all(-1, keepdim=True)
     matrices = entries.new_zeros(*entries.shape[:-1], 3, 3)
     matrices[..., UPPER[1], UPPER[0]] = entries.where(finite, 0.0)  # below the diagonal, where eigh looks
@@ -42,4 +40,11 @@ def quats_and_scales(upper: Tensor) -> tuple[Tensor, Tensor]:
     axes = axes * torch.where(torch.linalg.det(axes) < 0, -1.0, 1.0)[..., None, None]
     scales = values.clamp(min=0).sqrt().where(finite, torch.nan)
     quats = torch.from_numpy(quaternions(axes.reshape(-1, 3, 3).numpy())).view(*axes.shape[:-2], 4)
-    return quats.to(upper.dtype), scales.to(upper.dtype)
+    return quats.to(covars.dtype), scales.to(covars.dtype)
+
+
+def whole(upper: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Matrices [N, 3, 3] with these entries [N, 6], and 0 below the diagonal."""
+    matrices = np.zeros((len(upper), 3, 3), upper.dtype)
+    matrices[:, UPPER[0], UPPER[1]] = upper
+    return matrices

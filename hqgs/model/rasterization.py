@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypedDict, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from hqgs._rust import EPS2D, FAR_PLANE, NEAR_PLANE, TILE
+from hqgs.base.threads import one_torch_thread
 from hqgs.model.arguments import (
     as_backgrounds,
     batch_of,
@@ -20,49 +21,15 @@ from hqgs.model.arguments import (
     short,
 )
 from hqgs.model.autograd import _Composite, _Project
-from hqgs.model.covariances import quats_and_scales, upper_entries
+from hqgs.model.covariances import quats_and_scales
+from hqgs.model.meta import Later, Meta, OfScene, Pairs, RasterizationMeta
 
 __all__ = ["RasterizationMeta", "rasterization"]
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 
 
-class RasterizationMeta(TypedDict):
-    """What `rasterization` knows beside its images, of N Gaussians in C cameras.
-
-    Packed, [C, N] is [M]: the pairs of camera and Gaussian that are not culled, by camera, then Gaussian.
-    """
-
-    means2d: Tensor  # [C, N, 2], pixels; call `.retain_grad()` on it to get its gradient
-    radii: Tensor  # [C, N, 2], int32, pixels; 0 where culled
-    depths: Tensor  # [C, N], world units along the viewing axis
-    conics: Tensor  # [C, N, 3], 1/px^2: the inverse 2D covariance's xx, xy, yy
-    opacities: Tensor  # [C, N], after the compensation of "antialiased"
-    batch_ids: Tensor | None  # [M], int64, the scene of each pair, all three None where nothing is packed
-    camera_ids: Tensor | None  # [M], the camera
-    gaussian_ids: Tensor | None  # [M], the Gaussian
-    width: int
-    height: int
-    tile_size: int
-    tile_width: int  # tiles in a row of the image
-    tile_height: int
-    n_batches: int
-    n_cameras: int
-    work: tuple[int, int, int]  # pairs of Gaussian and tile, blocks evaluated, blocks with a change
-
-
-_TILE_LISTS = ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
-
-
-class _Meta(dict[str, Any]):
-    """A dictionary that says of what gsplat has besides that it is not there."""
-
-    def __missing__(self, key: str) -> Any:
-        if key in _TILE_LISTS:
-            raise KeyError(f"{key}: hqgs hands out no tile lists")
-        raise KeyError(key)
-
-
+@one_torch_thread()
 def rasterization(
     means: Tensor,
     quats: Tensor | None,
@@ -144,17 +111,16 @@ def rasterization(
     for name, value in (("means", means), ("viewmats", viewmats)):
         if not isinstance(value, Tensor):
             raise ValueError(f"{name}: expected a torch tensor, got {short(value)}")
-    upper = None if covars is None else upper_entries(covars, means)
-    if upper is not None and activate:
+    if covars is not None and activate:
         raise ValueError("activate: not with covars, which are no logarithms")
-    if upper is not None:
-        quats, scales = quats_and_scales(upper)
+    if covars is not None:
+        quats, scales = quats_and_scales(covars, means)
     tensors: dict[str, Any] = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     tensors["colors"] = colors
     if rest is not None:
         tensors["colors[1]"] = rest
-    if upper is not None:
-        tensors["covars"] = upper
+    if covars is not None:
+        tensors["covars"] = covars
     batch = batch_of({**tensors, "viewmats": viewmats, "Ks": Ks})
     if backgrounds is not None:
         c = viewmats.shape[len(batch)] if viewmats.dim() > len(batch) else 0
@@ -179,37 +145,43 @@ def rasterization(
     numbers = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
     config = (int(width), int(height), (*numbers, rasterize_mode == "antialiased"), activate, sh_degree)
     projected = [_project(scene, config) for scene in scenes]
-    ids = [(s["radii"] > 0).all(-1).nonzero(as_tuple=True) for s in projected] if packed else None
+    pairs = Pairs([splats["radii"] for splats in projected]) if packed else None
+    parts: Sequence[Tensor | None] = [None] * len(scenes)
 
     def together(values: Sequence[Tensor]) -> Tensor:
         return torch.stack([*values]).unflatten(0, batch) if batch else values[0]
 
-    def of_splats(name: str) -> Tensor:
+    def of_splats(name: str) -> Any:
         values = [splats[name] for splats in projected]
-        if ids is None:
-            return together(values)
-        return torch.cat([value[pair] for value, pair in zip(values, ids, strict=True)])
+        return together(values) if pairs is None else Later(pairs.packed, *values)
 
-    means2d = of_splats("means2d")
-    parts = [means2d]
-    if ids is not None:
-        parts = means2d.split([len(cameras) for cameras, _ in ids])
-    elif batch:
-        parts = means2d.flatten(0, len(batch) - 1).unbind(0)
     # What is composited is the one tensor that the caller gets, or a slice of it: so it has its gradient.
-    shots = zip(scenes, projected, parts if batch else [means2d], ids or [None] * len(scenes), strict=True)
-    images, alphas, works = zip(*(_composite(*shot, render_mode, absgrad) for shot in shots), strict=True)
-    meta: RasterizationMeta = {
+    means2d, dense = of_splats("means2d"), [splats["means2d"] for splats in projected]
+    if pairs is None and batch:
+        dense = means2d.flatten(0, len(batch) - 1).unbind(0)
+    elif pairs is not None and dense[0].requires_grad:
+        positions = pairs.positions(*dense)
+        means2d = Later(pairs.shown, positions, *dense)
+        parts = positions.split(pairs.counts) if batch else [positions]
+        if absgrad:  # it is left in there
+            pairs.shown(positions, *dense)
+    shots = zip(scenes, projected, dense, parts, strict=True)
+    images, alphas, works = zip(
+        *(
+            _composite(*shot, pairs and OfScene(pairs, k), render_mode, absgrad)
+            for k, shot in enumerate(shots)
+        ),
+        strict=True,
+    )
+    meta = {
         "means2d": means2d,
         "radii": of_splats("radii"),
         "depths": of_splats("depths"),
         "conics": of_splats("conics"),
         "opacities": of_splats("opacities"),
-        "batch_ids": None
-        if ids is None
-        else torch.cat([torch.full_like(k, b) for b, (k, _) in enumerate(ids)]),
-        "camera_ids": None if ids is None else torch.cat([cameras for cameras, _ in ids]),
-        "gaussian_ids": None if ids is None else torch.cat([gaussians for _, gaussians in ids]),
+        "batch_ids": pairs and Later(pairs.ids, 0),
+        "camera_ids": pairs and Later(pairs.ids, 1),
+        "gaussian_ids": pairs and Later(pairs.ids, 2),
         "width": int(width),
         "height": int(height),
         "tile_size": tile_size,
@@ -219,7 +191,7 @@ def rasterization(
         "n_cameras": c,
         "work": (sum(w[0] for w in works), sum(w[1] for w in works), sum(w[2] for w in works)),
     }
-    return together(images), together(alphas), cast(RasterizationMeta, _Meta(meta))
+    return together(images), together(alphas), cast(RasterizationMeta, Meta(meta))
 
 
 def _each_scene(tensors: dict[str, Tensor], dims: int) -> list[dict[str, Tensor]]:
@@ -233,7 +205,8 @@ def _each_scene(tensors: dict[str, Tensor], dims: int) -> list[dict[str, Tensor]
 def _project(scene: dict[str, Tensor], config: tuple[Any, ...]) -> dict[str, Any]:
     """The splats of one scene."""
     colors, sh_degree = scene["colors"], config[-1]
-    frame, means2d, link, depths, conics, radii, alphas, sh_colors = _Project.apply(
+    names = "frame", "means2d", "link", "depths", "conics", "radii", "opacities", "channels"
+    splats = _Project.apply(
         scene["means"],
         scene["quats"],
         scene["scales"],
@@ -246,43 +219,34 @@ def _project(scene: dict[str, Tensor], config: tuple[Any, ...]) -> dict[str, Any
         config,
         torch.is_grad_enabled(),
     )
-    return {
-        "frame": frame,
-        "means2d": means2d,
-        "link": link,
-        "depths": depths,
-        "conics": conics,
-        "radii": radii,
-        "opacities": alphas,
-        "channels": sh_colors if sh_degree is not None else colors,
-    }
+    found: dict[str, Any] = dict(zip(names, splats, strict=True))
+    return found if sh_degree is not None else found | {"channels": colors}
 
 
 def _composite(
     scene: dict[str, Tensor],
     splats: dict[str, Any],
     means2d: Tensor,
-    ids: tuple[Tensor, ...] | None,
+    packed: Tensor | None,
+    which: OfScene | None,
     render_mode: str,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
     """Images and alphas of one scene's splats, and the work that it was; `means2d` gets the gradient."""
     channels, depths, backgrounds = splats["channels"], splats["depths"], scene.get("backgrounds")
-    c = len(depths)
-    if backgrounds is not None and backgrounds.shape != (c, channels.shape[-1]):
-        wanted = [c, channels.shape[-1]]
+    wanted = [len(depths), channels.shape[-1]]
+    if backgrounds is not None and list(backgrounds.shape) != wanted:
         raise ValueError(f"backgrounds: expected shape {wanted}, got {shape_of(backgrounds)}")
-    if render_mode in ("D", "ED"):
-        channels, backgrounds = depths[..., None], None
-    elif render_mode != "RGB":
-        if channels.dim() == 2:
-            channels = channels.expand(c, *channels.shape)
-        channels = torch.cat([channels, depths[..., None]], dim=-1)
-        if backgrounds is not None:
-            backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(c, 1)], dim=-1)
-    image, alphas, work = _Composite.apply(
-        splats["frame"], means2d, splats["link"], splats["opacities"], channels, backgrounds, absgrad, ids
+    return _Composite.apply(
+        splats["frame"],
+        means2d,
+        packed,
+        splats["link"],
+        splats["opacities"],
+        channels,
+        depths,
+        backgrounds,
+        render_mode,
+        absgrad,
+        which,
     )
-    if render_mode.endswith("ED"):
-        image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
-    return image, alphas, work
