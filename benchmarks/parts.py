@@ -22,7 +22,7 @@ from pandas import DataFrame
 
 from benchmarks.command import Benchmark
 from benchmarks.measure import Run, Training
-from benchmarks.pages.figures import gain, number, pick, table
+from benchmarks.pages.figures import and_list, gain, number, pick, table
 from benchmarks.protocol import Row, narrowed, read_protocols
 from benchmarks.rows import text_of
 from benchmarks.study import Cell, Study, begin
@@ -147,6 +147,11 @@ def gains_of(runs: DataFrame, label: str, value: str = "psnr") -> Any:
     """What a part adds to runs in which it is on."""
     on = runs.loc[(runs["row"] == ALL) | runs["on"].astype(bool)]
     return gain(on, ALL, label, value)
+
+
+def lengths(runs: DataFrame) -> str:
+    """Of the runs: `400 and 1,000`."""
+    return and_list([f"{iterations:,.0f}" for iterations in sorted(set(runs["iterations"]))])
 
 
 def parts_table(runs: DataFrame) -> str:
