@@ -17,18 +17,14 @@ from tiny_scene import tiny_scene
 import hqgs
 from benchmarks.scenes.devices import draw_devices
 from hqgs.cli.main import main
-from hqgs.diagnosis.constants import PAYS
-from hqgs.diagnosis.devices import Devices, device_signs, grouped
-from hqgs.diagnosis.gains import SharedColors
-from hqgs.diagnosis.own import device_findings
+from hqgs.diagnosis.colors import PAYS, Devices, SharedColors, device_findings, device_signs, grouped
 from hqgs.evaluation.held_out import HeldOutViews, measured
 from hqgs.evaluation.looks import look_of, looks_of_devices
 from hqgs.evaluation.metrics import psnr
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.look import STEEPEST, Look, as_a_lens, darken, falloff, respond, squared_radii
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.training.methods.cameras import LearnedCameras
-from hqgs.training.methods.devices import KEPT, LearnedDevices
+from hqgs.training.methods.cameras import KEPT, LearnedCameras, LearnedDevices
 
 Floats = NDArray[np.float64]
 K = np.array([[40.0, 0, 17.5], [0, 40.0, 11.0], [0, 0, 1]])

@@ -12,8 +12,8 @@ from test_diagnose import clean_photo, degraded_scene
 from test_hqgs import fixed
 
 from hqgs.diagnosis import scene
-from hqgs.diagnosis.film_traces import film_detail
-from hqgs.diagnosis.own import Finding
+from hqgs.diagnosis.codec import film_detail
+from hqgs.diagnosis.photo import Finding
 from hqgs.diagnosis.scene import diagnose_scene
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
 from hqgs.photos.pixels import as_floats

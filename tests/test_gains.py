@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hqgs.diagnosis import gains
+from hqgs.diagnosis import colors as gains
 from hqgs.photos.light import to_srgb
 from hqgs.scene.scene import Camera, View
 

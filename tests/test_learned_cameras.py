@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-from hqgs.diagnosis import gains
+from hqgs.diagnosis import colors as gains
 from hqgs.diagnosis import scene as scene_diagnosis
-from hqgs.diagnosis.constants import TURNED, UNLIKE, UNLIKE_GAINS
-from hqgs.diagnosis.differences import unlike_sharpness
-from hqgs.diagnosis.gains import log_gains
+from hqgs.diagnosis.colors import UNLIKE_GAINS, log_gains
+from hqgs.diagnosis.differences import TURNED, UNLIKE, unlike_sharpness
 from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.exposure import take_photo
 from hqgs.photos.light import to_linear, to_srgb

@@ -17,8 +17,7 @@ from test_diagnose import clean_photo
 
 from benchmarks.scenes.panorama import panorama_room
 from hqgs.base.stages import Stage
-from hqgs.diagnosis.constants import TURNED
-from hqgs.diagnosis.differences import unlike_sharpness
+from hqgs.diagnosis.differences import TURNED, unlike_sharpness
 from hqgs.evaluation.metrics import psnr
 from hqgs.scene import views
 from hqgs.scene.faces import CUBE, around, face_name, faces_of

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from hqgs.diagnosis.choice import Sight, choose_photos
-from hqgs.diagnosis.sharpness import Sharpness, summarised
+from hqgs.diagnosis.differences import Sharpness, summarised
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.scene import Camera, Scene, View

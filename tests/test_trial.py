@@ -12,7 +12,7 @@ import pytest
 from tiny_scene import tiny_scene
 
 from hqgs.base.files import CHECKPOINT
-from hqgs.diagnosis.own import Finding
+from hqgs.diagnosis.photo import Finding
 from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.scene.scene import Scene
@@ -103,6 +103,17 @@ def test_short_runs_are_judged_by_photos_that_they_have_not_seen() -> None:
     assert found.gain == pytest.approx(20 * np.log10(GAUSSIAN / trial.PIXELS), abs=0.3)  # as errors are
     assert found.error < 0.1
     assert found.sure > 1  # renders without growth are better by each measure
+
+
+def test_a_trial_ends_where_its_first_photos_all_lose_without_growth(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trial, "PIXELS", 2 * GAUSSIAN)  # a run that grows has fewer than one that does not
+    scene, seen = tiny_scene(12), list[Scene]()
+    plan = RunPlan(replace(ASKED, iterations=10**6), FIRST, True, True, 0, 0, 0)
+    found = trial.tried_growth(scene, plan, lambda *of: seen.append(of[0]) or FakeRun(*of))  # type: ignore[arg-type]
+    assert found is not None
+    assert len(seen) == 1
+    assert found.photos == len(seen[0].test)
+    assert not found.pays
 
 
 class FakeLooks(FakeRun):

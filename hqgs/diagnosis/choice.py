@@ -11,15 +11,7 @@ from numpy.typing import NDArray
 from hqgs.base.evenly import evenly
 from hqgs.base.left_out import PHOTO, LeftOut
 from hqgs.base.text import some
-from hqgs.diagnosis.constants import (
-    CHOICE_LEAST_BLUR,
-    CHOICE_POINTS,
-    CHOICE_SHARED,
-    MOST_TURNED,
-    UNUSUAL,
-    WELL_SEEN,
-)
-from hqgs.diagnosis.sharpness import PhotoSummary, Sharpness, summarised
+from hqgs.diagnosis.differences import PhotoSummary, Sharpness, summarised
 from hqgs.scene.constants import ENOUGH_SHOW
 from hqgs.scene.geometry import in_frame
 from hqgs.scene.scene import Scene, View
@@ -30,7 +22,8 @@ class Sight:
 
     def __init__(self, views: Sequence[View], points: NDArray[np.float32]) -> None:
         """`points` [*, 3], world."""
-        world = points[evenly(len(points), CHOICE_POINTS)].astype(np.float64)
+        # of the scene's, evenly spread, that are looked for in the photos
+        world = points[evenly(len(points), 600)].astype(np.float64)
         self._inside = np.stack([in_frame(view.camera, world) for view in views])  # [N, P]
         rays = world - np.stack([view.camera.center for view in views])[:, None]
         lengths = np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -40,7 +33,8 @@ class Sight:
         """[N, p]: which views see each of the p points that `view` sees, from the same side; itself: none."""
         seen = self._inside[view]
         turned = np.einsum("npk,pk->np", self._rays[:, seen], self._rays[view, seen])
-        covered = self._inside[:, seen] & (turned >= MOST_TURNED)
+        # between two rays to a point; beyond, it may be another side of a thing
+        covered = self._inside[:, seen] & (turned >= (np.cos(np.deg2rad(45))))
         covered[view] = False
         return covered
 
@@ -110,7 +104,8 @@ def _needless(views: list[View], points: NDArray[np.float32], notes: list[str]) 
 def _peers(sight: Sight, view: int) -> NDArray[np.int64]:
     """The views that see at least half of what `view` sees."""
     covered = sight.covered(view)
-    return np.flatnonzero(covered.sum(1) >= max(CHOICE_SHARED * covered.shape[1], 1))
+    # of a photo's points that another must see to be compared with it
+    return np.flatnonzero(covered.sum(1) >= max(0.5 * covered.shape[1], 1))
 
 
 def _empty(
@@ -153,13 +148,14 @@ def _blurred(
         return {}
     squares = np.array([sigma * abs(sigma) for sigma in sigmas.values()])
     spread = 1.4826 * float(np.median(np.abs(squares - np.median(squares))))
-    least = max(CHOICE_LEAST_BLUR, float(np.sqrt(UNUSUAL * spread)))
+    # robust standard deviations of sigma^2 over the scene
+    least = max(2.0, float(np.sqrt(4.0 * spread)))  # px, sigma of a Gaussian
     found = sorted((k for k, sigma in sigmas.items() if sigma >= least), key=lambda k: -sigmas[k])
     sharp = np.array([k not in gone and k not in found for k in range(len(views))])
     drops, needed = {}, []
     for k in found:
         well_seen = float((sight.covered(k)[sharp].sum(0) >= ENOUGH_SHOW).mean())
-        if well_seen < WELL_SEEN:
+        if well_seen < 0.98:  # of the points of a blurred photo, without it
             needed.append(f"{views[k].name} ({sigmas[k]:.1f} px; {1 - well_seen:.0%} of its points)")
             continue
         evidence = (

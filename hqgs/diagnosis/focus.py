@@ -10,19 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from hqgs.base.evenly import evenly
-from hqgs.diagnosis.constants import (
-    FEWEST_POINTS,
-    FOCUS_COARSE,
-    FOCUS_DARK,
-    FOCUS_FINE,
-    FOCUS_LARGEST,
-    FOCUS_LEAST,
-    FOCUS_MOST_POINTS,
-    FOCUS_WINDOW,
-    MOST_PHOTOS,
-    NEARNESS,
-    ROUNDS,
-)
+from hqgs.diagnosis.photo import Finding
 from hqgs.photos.pixels import as_floats, luma
 from hqgs.photos.resize import area_downscale
 from hqgs.scene.constants import ENOUGH_SHOW, FEWEST_PHOTOS
@@ -30,6 +18,13 @@ from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Scene, View
 
 Floats = NDArray[np.float64]
+ROUNDS = 30  # of medians of photos and points in turn
+GOES_WITH_DEPTH, DIFFERS = 0.06, 0.4  # from these values of `FocusSigns` on, photos differ in focus
+MOST_PHOTOS, FOCUS_MOST_POINTS = 60, 4000  # that are looked at
+# px: sigmas between which details lie, and the window around a point
+FOCUS_FINE, FOCUS_COARSE, FOCUS_WINDOW = 0.8, 2.4, 9
+FOCUS_LARGEST = 2000  # px: the longest side of what is looked at of a photo
+FOCUS_DARK = 0.5 / 255  # contrast below which there is nothing to be sharp
 
 
 @dataclass(frozen=True)
@@ -62,7 +57,7 @@ def focus_signs(scene: Scene) -> FocusSigns | None:
         _look(view, scene.points[points[rows]].astype(np.float64), rows, sharp[k], depths[k])
     told = np.isfinite(sharp)
     keep = told.sum(0) >= ENOUGH_SHOW
-    if told[:, keep].sum() < FEWEST_POINTS * len(views):
+    if told[:, keep].sum() < 40 * len(views):  # of each photo on average
         return None
     sharp, depths = sharp[:, keep], np.where(told, depths, np.nan)[:, keep]
     halves = [_of_photos(sharp[:, half::2], depths[:, half::2]) for half in (0, 1)]
@@ -97,7 +92,8 @@ def _of_photos(sharp: Floats, depths: Floats) -> tuple[Floats, Floats]:
     """For each photo, the share of its points' sharpness that goes with nearness, and the rest, [N] each."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of points or photos that tell nothing
-        near = np.exp(np.nanmedian(depths, axis=1, keepdims=True) - depths).clip(*NEARNESS)
+        # that count; the photo's median depth has 1
+        near = np.exp(np.nanmedian(depths, axis=1, keepdims=True) - depths).clip(*(0.2, 3.0))
         near -= np.nanmean(near, axis=1, keepdims=True)
         farther = depths - np.nanmean(depths, axis=0)
         squares = np.nansum(near**2, axis=1)
@@ -109,7 +105,8 @@ def _of_photos(sharp: Floats, depths: Floats) -> tuple[Floats, Floats]:
             left = told - own
             rest = np.nan_to_num(np.nanmedian(left - slope[:, None] * near, axis=1))
             off = (left - rest[:, None]).clip(-1, 1)
-            slope = np.nansum(near * off, axis=1) / (squares + FOCUS_LEAST)
+            # added to the sum of squares of a photo's nearness: few points tell no slope
+            slope = np.nansum(near * off, axis=1) / (squares + 0.25)
             slope, rest = slope - np.median(slope), rest - np.median(rest)
             off = sharp - own - rest[:, None] - slope[:, None] * near
             with_distance = float(np.nansum(off * farther) / max(np.nansum(farther**2), 1e-9))
@@ -121,3 +118,18 @@ def _agreed(first: Floats, second: Floats) -> float:
     """The standard deviation of what two estimates have in common."""
     common = np.mean((first - first.mean()) * (second - second.mean()))
     return float(np.sqrt(max(common, 0.0)))
+
+
+def focus_finding(scene: Scene, shaken: bool) -> Finding:
+    """`shaken`: photos then differ in sharpness as a whole, whatever their focus."""
+    signs = focus_signs(scene)
+    if signs is None:
+        return Finding("focus", False, None, None, None, "the photos share too few points to tell")
+    needed = signs.with_depth >= GOES_WITH_DEPTH or (signs.in_all >= DIFFERS and not shaken)
+    reason = (
+        f"points are sharper or softer from photo to photo by {signs.with_depth:.2f} with their distance and "
+        f"by {signs.in_all:.2f} in all"
+    )
+    if not needed:
+        reason += f" (needed from {GOES_WITH_DEPTH:g} or {DIFFERS:g} in the logarithm of contrast)"
+    return Finding("focus", needed, signs.with_depth, None, "focus" if needed else None, reason)

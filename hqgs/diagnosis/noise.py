@@ -6,20 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hqgs.diagnosis.constants import (
-    FEW_PATCHES,
-    HALF_TILE,
-    LARGE_PATCH,
-    LIMIT,
-    MAX_PATCHES,
-    MIN_PATCHES,
-    NOISE_BLOCK,
-    NOISIEST,
-    SMALL_LIMIT,
-    SMALL_PATCH,
-)
 from hqgs.photos.jpeg import ENOUGH_BLOCKS, blocks_of
 from hqgs.photos.pixels import Floats, luma
+
+LARGE_PATCH, SMALL_PATCH = 5, 3  # px
+LIMIT, SMALL_LIMIT = 2.5, 4.0  # levels: photos of fine texture without noise reach 1.9, small ones 3.2
+MIN_PATCHES, MAX_PATCHES = 200, 12_000  # that are needed, and that are looked at
 
 
 @dataclass(frozen=True)
@@ -41,12 +33,14 @@ def estimate_noise(levels: Floats) -> Noise | None:
     out, where clipping takes noise away. Noise that a later step made smooth (JPEG, enlargement) is not seen.
     """
     height, width = levels.shape[:2]
-    size = LARGE_PATCH if height * width >= 4 * FEW_PATCHES else SMALL_PATCH
+    # below this the large patch has too many directions for the photo
+    size = LARGE_PATCH if height * width >= 4 * 4_000 else SMALL_PATCH
     if min(height, width) < size:
         return None
     step = max(1, int(np.sqrt(height * width / MAX_PATCHES)))
     patches = np.lib.stride_tricks.sliding_window_view(levels, (size, size), axis=(0, 1))[::step, ::step]
-    rows, columns = np.indices(patches.shape[:2]) * step // HALF_TILE
+    # px: the photo is cut into a chessboard of tiles of this size
+    rows, columns = np.indices(patches.shape[:2]) * step // 24
     white = ((rows + columns) % 2 == 0).ravel()
     vectors = patches.reshape(-1, 3 * size * size)
     clipped = ((vectors == 0) | (vectors == 255)).any(axis=1)
@@ -70,7 +64,8 @@ def neighbour_correlation(levels: Floats) -> float | None:
     pixels still go together. What a photo shows raises it, so it is taken of the blocks with the least. White
     noise strong enough to be told comes to 0.12 at most, a phone's, denoised and as JPEG, to 0.24 to 0.5.
     """
-    blocks = blocks_of(luma(levels), NOISE_BLOCK)
+    # px a side: blocks without clipped values tell how neighbours go together
+    blocks = blocks_of(luma(levels), 16)
     blocks = blocks[((blocks > 0) & (blocks < 255)).all((1, 2))]
     one, two = (
         np.square(blocks[:, n:] - blocks[:, :-n]).mean((1, 2))
@@ -80,4 +75,4 @@ def neighbour_correlation(levels: Floats) -> float | None:
     if (two > 0).sum() < ENOUGH_BLOCKS:
         return None
     together = 1 - one[two > 0] / two[two > 0]
-    return float(max(np.quantile(together, NOISIEST), 0.0))
+    return float(max(np.quantile(together, 0.05), 0.0))  # share of the blocks that show noise and little else

@@ -8,18 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.diagnosis.blur import Blur, estimate_blur, extra_sigma
-from hqgs.diagnosis.coefficients import Hidden, estimate_hidden, quantised
-from hqgs.diagnosis.constants import (
-    HIDING_QUALITY,
-    LARGEST,
-    LEAST_BLUR,
-    LUMA_TELLS,
-    PHOTO_FEW_BLOCKS,
-    SHARPER,
-)
-from hqgs.diagnosis.film_traces import film_detail
-from hqgs.diagnosis.jpeg_traces import Jpeg, find_jpeg
+from hqgs.diagnosis.blur import LARGEST, LEAST_BLUR, Blur, estimate_blur, extra_sigma
+from hqgs.diagnosis.codec import Hidden, Jpeg, estimate_hidden, film_detail, find_jpeg, quantised
 from hqgs.diagnosis.noise import estimate_noise, neighbour_correlation
 from hqgs.diagnosis.resolution import Enlargement, find_enlargement, undo_enlargement
 from hqgs.photos.formula import small_side
@@ -30,6 +20,18 @@ Table = tuple[tuple[int, ...], ...]
 Photo = NDArray[np.uint8] | NDArray[np.float32]
 
 ROUNDING_ONLY: Table = ((1,) * 8,) * 8
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One step of how the photos were made, and whether the method must undo it."""
+
+    name: str  # "exposure", "shake", "focus", "blur", "lowres", "noise", "jpeg" or "video"
+    needed: bool
+    value: float | None  # median over photos: px, factor, levels or quality; None: not told
+    spread: float | None  # robust standard deviation over photos; None: estimated from all of them together
+    step: str | None  # in the grammar of `parse_formation`, where needed
+    reason: str  # one sentence
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,8 @@ class PhotoDiagnosis:
     @property
     def hiding(self) -> bool:
         """Whether its JPEG hides the photo's noise and blur from all but the coefficients."""
-        return self.jpeg.quality is not None and self.jpeg.quality < HIDING_QUALITY
+        # from this quality on, JPEG leaves the luma's noise and spectrum as they were
+        return self.jpeg.quality is not None and self.jpeg.quality < 92
 
 
 @dataclass(frozen=True)
@@ -135,10 +138,12 @@ def conclude(photos: Sequence[Inspected]) -> list[PhotoDiagnosis]:
         members = [k for k, photo in enumerate(photos) if photo.table == table]
         hiding = table is not ROUNDING_ONLY
         shown = [d.noise - d.noise_limit for k in members if (d := diagnoses[k]).noise is not None]
-        large = min(min(photos[k].kept.shape[:2]) for k in members) >= LUMA_TELLS
+        # px a side; the coefficients of smaller photos have the fine texture of large ones
+        large = min(min(photos[k].kept.shape[:2]) for k in members) >= 100
         hidden = None
         if hiding or (large and shown and np.median(shown) < 0):
-            share = -(-(MAX_BLOCKS if hiding else PHOTO_FEW_BLOCKS) // len(members))
+            # of all photos together, to look for noise in the luma alone
+            share = -(-(MAX_BLOCKS if hiding else 1_000) // len(members))
             steps = np.array(table)
             corners = [diagnoses[k].jpeg.phase if hiding else (0, 0) for k in members]
             blocks = [
@@ -179,7 +184,8 @@ def _with_blur(photo: PhotoDiagnosis, levels: Floats, hidden: Hidden | None) -> 
 
 def _least_blur(limit: float, enlargement: Enlargement) -> float:
     """The least blur that is told, px of the small photo; `limit`: of photos that were not enlarged."""
-    return limit - SHARPER if enlargement.factor > 1 else limit
+    # px of the small photo: shrinking halves a camera's own softness or more, to 0.45 at most
+    return limit - 0.2 if enlargement.factor > 1 else limit
 
 
 def _enlarged(blur: Blur, scale: float) -> Blur:

@@ -9,10 +9,13 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from hqgs.diagnosis.constants import FACTORS, GRID_MIN_EVIDENCE, LONGEST, ROUNDING
 from hqgs.photos.pixels import Floats, luma
 from hqgs.photos.resize import resize_matrix
 from hqgs.scene.constants import SMALLEST_SIDE
+
+FACTORS = (2, 3, 4, 6, 8)  # of enlargement that are tried
+LONGEST = 768  # px of a line that are looked at
+ROUNDING = 0.05  # levels; a residual below this counts as this
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ def find_enlargement(levels: Floats) -> Enlargement:
         columns = _best_size(grey.T[:, ::4], factor)
         candidates.append((min(rows[0], columns[0]), factor, rows[1], columns[1]))
     evidence, factor, small_height, small_width = max(candidates)
-    if evidence < GRID_MIN_EVIDENCE:
+    if evidence < 2.1:  # JPEG blocks reach 1.8 at factor 2; bicubic enlargement kept in 8 bits starts at 4.5
         return Enlargement(1, evidence, height, width)
     return Enlargement(factor, evidence, small_height, small_width)
 

@@ -12,22 +12,28 @@ from numpy.typing import NDArray
 from hqgs.base.evenly import evenly
 from hqgs.base.left_out import LeftOut
 from hqgs.base.stages import OnStage, Stage, silent
-from hqgs.diagnosis.constants import (
-    BAD_QUALITY,
-    COARSE_FILM,
-    MOST_PHOTOS,
-    PROBES,
-    SCENE_WHITE,
-    UNLIKE_NOISE,
-    VISIBLE_QUALITY,
+from hqgs.diagnosis.colors import (
+    DeviceSigns,
+    device_findings,
+    device_signs,
+    exposure_finding,
+    log_gains,
+    shared_colors,
 )
-from hqgs.diagnosis.devices import DeviceSigns, device_signs
-from hqgs.diagnosis.gains import log_gains, shared_colors
-from hqgs.diagnosis.own import Finding, device_findings, exposure_finding, focus_finding, shake_finding
-from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
+from hqgs.diagnosis.differences import shake_finding
+from hqgs.diagnosis.focus import MOST_PHOTOS, focus_finding
+from hqgs.diagnosis.photo import Finding, Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
 from hqgs.photos.formula import KINDS, NONE, parse_formation, within
 from hqgs.scene.scene import Scene, View
+
+PROBES = 4  # photos searched for enlargement; if they agree, the others are taken to be like them
+SCENE_WHITE = 0.2  # up to this correlation of neighbours, noise counts as white
+# JPEG is undone below the first quality, or below the second where blur, noise or an enlargement is undone.
+BAD_QUALITY, VISIBLE_QUALITY = 25, 85
+# Of `fine_detail`; crf 36 leaves 0.15 to 0.25, crf 28 0.2 to 0.45, sharp photos have 0.3 to 0.5.
+COARSE_FILM = 0.24
+
 
 _HEAD = ("photo", "size", "enlarged", "jpeg", "blocking", "noise", "blur")
 
@@ -92,11 +98,11 @@ class Inspector:
         return self._inspected[key][1]
 
     def log_gains(self, scene: Scene) -> NDArray[np.float64] | None:
-        """`hqgs.diagnosis.gains.log_gains` of the training photos."""
+        """`hqgs.diagnosis.colors.log_gains` of the training photos."""
         return self._told_by_colors(scene)[0]
 
     def device_signs(self, scene: Scene) -> DeviceSigns | None:
-        """`hqgs.diagnosis.devices.device_signs` of the training photos."""
+        """`hqgs.diagnosis.colors.device_signs` of the training photos."""
         return self._told_by_colors(scene)[1]
 
     def _told_by_colors(self, scene: Scene) -> tuple[NDArray[np.float64] | None, DeviceSigns | None]:
@@ -250,7 +256,8 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
     if together > SCENE_WHITE:
         kind = "noise of at least"
         more = f"; neighbouring pixels go together by {together:.2f} at least: not white"
-    if spread is not None and noisy > 0.1 * len(known) and loud >= UNLIKE_NOISE * quiet:
+    # times the noise of the quieter photos in the noisier ones: each has its own
+    if spread is not None and noisy > 0.1 * len(known) and loud >= 2.5 * quiet:
         reason = f"{kind} {quiet:.1f} levels in some photos and {loud:.1f} in others{more}"
         return Finding("noise", True, level, spread, "grain", reason)
     if level >= limit:

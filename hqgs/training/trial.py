@@ -88,6 +88,8 @@ def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = 
             for changes in ({"max_gaussians": most}, no_growth(growth))
         )
         found.append(still - grown)
+        if found[-1][:, 0].max(initial=-np.inf) < 0:  # all of the first are worse: others do not turn it
+            break
     return _told(np.concatenate(found))
 
 

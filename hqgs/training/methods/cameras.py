@@ -1,15 +1,23 @@
-"""What each photo's camera did, learned with the scene: its trajectory in the exposure time, lens and gains.
+"""What each photo's camera did, learned with the scene: its trajectory in the exposure time, lens and gains;
+and what cameras do to all of their photos, vignetting and response.
 
 One render, warped along the trajectory and over the lens (`hqgs/photos/exposure.py`), stands for the whole
 exposure. What photos cannot tell is fixed by construction: the mean of a trajectory is the photo's pose, the
-mean of the log gains is that which they start with.
+mean of the log gains is that which they start with, that of the responses is 0. Nor can they tell how bright
+the scene is where lenses are dark: it is shown as the mean camera has it (`hqgs.photos.look`), with bright
+corners, and as bright as the photos are in the mean.
+
+A thin lens is two numbers (slope, offset), px: a point of nearness n, which is its inverse depth with 1 at
+the photo's median, becomes a disc of radius |slope n + offset|. In focus is n = -offset / slope; the sign of
+both says nothing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,14 +26,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs.base.elementary import exp
+from hqgs.diagnosis.colors import Devices
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map
 from hqgs.photos.exposure import take_photo
-from hqgs.photos.look import MOST_GAIN, Look
+from hqgs.photos.formation import GOLDEN
+from hqgs.photos.look import MOST_GAIN, Look, as_a_lens, as_responses, darken, falloff, respond, squared_radii
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.training.methods.devices import LearnedDevices, groups_of, load_into, state_of
-from hqgs.training.methods.lens import first_lens, lens_warps, samples, sharp_at, widest
 
 # Shares of the run before which trajectories would hide what the scene does not show yet, at which short ones
 # are given up, and of the rates at the end.
@@ -34,6 +42,11 @@ SHORTEST_TRAJECTORY = 0.7  # px, of the picture's middle, and the widest disc: a
 FIRST_TRAJECTORY = 1e-3  # of the photo's width, standard deviation: from 0 it has no direction to grow in
 TRAJECTORY_POINTS = 9  # that stand for a trajectory
 MOST_MARGIN = 48  # px around a render
+MEAN_SQUARES = 1 / 3, 0.16  # of r^2 and r^4 over a picture, the latter 0.156 (a square) to 0.168 (16:9)
+KEPT = 8  # maps of squared radii; photos may each have a camera of their own
+FIRST_RADIUS = 0.0015  # of the photo's width: from 0 it has no direction to grow in
+LENS_NEAREST, LENS_FARTHEST = 2.0, 0.3  # nearness of what photos show, as far as sizes of discs go
+FEWEST_SAMPLES, MOST_SAMPLES = 6, 24  # of the aperture
 
 
 @dataclass(frozen=True)
@@ -51,7 +64,7 @@ class LearnedCamera:
     name: str
     trajectory: NDArray[np.float64]  # [9, 2], px: of the picture's middle during the exposure; of mean 0
     gains: NDArray[np.float64]  # [3], of red, green and blue in linear light
-    lens: NDArray[np.float64]  # [2], px: see `hqgs.training.methods.lens`
+    lens: NDArray[np.float64]  # [2], px: of a thin lens: slope and offset
     vignetting: NDArray[np.float64]  # [2] and
     response: NDArray[np.float64]  # [2, 3], as `hqgs.photos.look` has them
 
@@ -321,3 +334,150 @@ def _moved(warps: Tensor, camera: Camera, nearness: float) -> Tensor:
 def _enlarged(near: Tensor, size: tuple[int, int]) -> Tensor:
     """A map [h, w] at the photo's size."""
     return torch.nn.functional.interpolate(near.float()[None, None], size, mode="bilinear")[0, 0]
+
+
+class LearnedDevices:
+    """The cameras of a scene's training photos."""
+
+    def __init__(self, first: Devices, vignetting: bool, response: bool) -> None:
+        """`vignetting` and `response`: which of them is learned; what is not does nothing."""
+        self._of_photo = first.of_photo
+        self._vignetting = _trained(first.vignetting if vignetting else [])
+        self._response = _trained(first.response if response else [])
+        counts = np.bincount(first.of_photo[first.of_photo >= 0], minlength=len(first))
+        self._shares = torch.from_numpy(counts / max(counts.sum(), 1))
+        self._told = counts.sum() / max(len(first.of_photo), 1)  # share of the photos that have a camera
+        self._squares = lru_cache(KEPT)(_squares)
+        self.center()
+
+    def level(self) -> Tensor:
+        """The mean of the logarithm of what lenses keep from photos: gains beside it leave their mean."""
+        if not self._vignetting:
+            return torch.zeros((), dtype=torch.float64)
+        means = torch.stack([*self._vignetting]) @ torch.tensor(MEAN_SQUARES, dtype=torch.float64)
+        return self._told * (self._shares * means).sum()
+
+    def develop(self, number: int, camera: Camera, taken: Tensor) -> Tensor:
+        """The photo of this number of what was taken without its camera's faults, [H, W, 3]."""
+        device = int(self._of_photo[number])
+        if device < 0:
+            return taken
+        planes = taken.permute(2, 0, 1).contiguous()  # a factor of a channel, or of a pixel, is quicker so
+        if self._vignetting:
+            height, width = taken.shape[:2]
+            center = float(camera.K[0, 2]), float(camera.K[1, 2])
+            squares = self._squares(height, width, center, taken.dtype)
+            planes = darken(planes, falloff(squares, self._vignetting[device].to(taken.dtype)))
+        if self._response:
+            planes = respond(planes, self._response[device])
+        return planes.permute(1, 2, 0).contiguous()
+
+    @torch.no_grad()
+    def center(self) -> None:
+        """What photos cannot tell stays, light falls towards corners, and responses rise: after each step."""
+        for vignetting in self._vignetting:
+            vignetting.copy_(torch.from_numpy(as_a_lens(vignetting.numpy())))
+        if not self._response:
+            return
+        each = torch.stack([*self._response])
+        each -= (self._shares[:, None, None] * each).sum(0)
+        for response, value in zip(self._response, as_responses(each.numpy()), strict=True):
+            response.copy_(torch.from_numpy(value))
+
+    def learned(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Vignetting [2] and response [2, 3] of the photo's camera."""
+        device = int(self._of_photo[number])
+        vignetting, response = np.zeros(2), np.zeros((2, 3))
+        if device >= 0 and self._vignetting:
+            vignetting = self._vignetting[device].detach().numpy().copy()
+        if device >= 0 and self._response:
+            response = self._response[device].detach().numpy().copy()
+        return vignetting, response
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        return groups_of(self._named())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return state_of(self._named())
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        load_into(self._named(), state)
+
+    def _named(self) -> dict[str, list[Tensor]]:
+        return {"vignetting": self._vignetting, "response": self._response}
+
+
+def _squares(height: int, width: int, center: tuple[float, float], dtype: torch.dtype) -> Tensor:
+    """r^2 of each pixel of photos with this principal point, [H, W]."""
+    K = np.eye(3)
+    K[:2, 2] = center
+    return torch.from_numpy(squared_radii(height, width, K)).to(dtype)
+
+
+def groups_of(named: Mapping[str, list[Tensor]]) -> list[dict[str, Any]]:
+    """Groups of an optimizer, of the tensors that are trained under each name; none where there are none."""
+    return [
+        {"name": name, "params": params, "lr": 0.0, "betas": (0.9, 0.99)}
+        for name, params in named.items()
+        if params
+    ]
+
+
+def state_of(named: Mapping[str, list[Tensor]]) -> dict[str, Tensor]:
+    """The tensors as a checkpoint names them."""
+    return {f"{name}.{k}": value.detach() for name, values in named.items() for k, value in enumerate(values)}
+
+
+@torch.no_grad()
+def load_into(named: Mapping[str, list[Tensor]], state: dict[str, Tensor]) -> None:
+    """The values of `state_of` into these tensors."""
+    for name, values in named.items():
+        for k, value in enumerate(values):
+            value.copy_(state[f"{name}.{k}"])
+
+
+def _trained(values: Iterable[NDArray[np.float64]]) -> list[Tensor]:
+    return [torch.from_numpy(value.copy()).requires_grad_() for value in values]
+
+
+def first_lens(width: float) -> Tensor:
+    """Of a photo of this width: all of it out of focus alike, by little."""
+    return torch.tensor([0.0, FIRST_RADIUS * width], dtype=torch.float64)
+
+
+def widest(slope: float, offset: float) -> float:
+    """The largest radius, px."""
+    return max(abs(slope * n + offset) for n in (LENS_NEAREST, LENS_FARTHEST))
+
+
+def sharp_at(slope: float, offset: float) -> float | None:
+    """The depth in focus, 1 at the photo's median; None: all that photos show is in focus, or nothing."""
+    near = -offset / slope if slope else 0.0
+    return 1 / near if LENS_FARTHEST <= near <= LENS_NEAREST else None
+
+
+def samples(lens: Tensor) -> int:
+    """How many points of the lens stand for all of it: one for 2.5 px of the largest disc."""
+    return min(max(FEWEST_SAMPLES, math.ceil(math.pi * widest(*lens.tolist()) ** 2 / 2.5)), MOST_SAMPLES)
+
+
+def lens_warps(lens: Tensor, count: int) -> Tensor:
+    """Warps for `take_photo` of `count` points of the lens, [count, 3, 4]: shifts that go with nearness."""
+    shifts = _sunflower(count)
+    warps = torch.zeros(count, 3, 4, dtype=torch.float64)
+    warps[:, :2, 2] = shifts * lens[1]
+    warps[:, :2, 3] = shifts * lens[0]
+    return warps
+
+
+def _sunflower(count: int) -> Tensor:
+    """Points spread evenly over the unit disc, [count, 2], of mean 0.
+
+    Neighbours in the list lie far apart: the same warps may stand for a trajectory, one moment after another.
+    """
+    k = torch.arange(count, dtype=torch.float64)
+    order = (k * (GOLDEN / (2 * math.pi)) % 1).argsort().double()
+    radii, angles = ((order + 0.5) / count).sqrt(), GOLDEN * order
+    points = torch.stack([radii * angles.cos(), radii * angles.sin()], 1)
+    points -= points.mean(0)
+    return points * (0.5 / points.square().sum(1).mean()).sqrt()  # the second moment of a disc

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hqgs.diagnosis.devices import plain_devices
+from hqgs.diagnosis.colors import plain_devices
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.shapes import enlarge
@@ -21,8 +21,7 @@ from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import HQGSConfig
 from hqgs.training.methods.base import Method
-from hqgs.training.methods.cameras import LearnedCamera, LearnedCameras, Shot, no_shot
-from hqgs.training.methods.devices import LearnedDevices
+from hqgs.training.methods.cameras import LearnedCamera, LearnedCameras, LearnedDevices, Shot, no_shot
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
