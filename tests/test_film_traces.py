@@ -78,7 +78,7 @@ def test_the_codec_decides_what_is_left_of_fine_details() -> None:
 
 
 def test_frames_of_a_coarse_film_differ_by_its_codec(monkeypatch: pytest.MonkeyPatch) -> None:
-    shaken = Finding("shake", True, 0.25, None, "shake", "photos differ by 0.25 in sharpness")
+    shaken = Finding("shake", "photos differ by 0.25 in sharpness", "shake", 0.25)
     monkeypatch.setattr(scene, "shake_finding", lambda _: shaken)
     good, coarse = map(diagnose_scene, films())
     assert (good.formation, coarse.formation) == ("shake", "video")

@@ -150,7 +150,7 @@ def test_a_look_is_kept_where_photos_held_back_gain_by_it() -> None:
 
 
 def found_of(*names: str) -> Diagnosis:
-    parts = tuple(Finding(name, True, 0.2, None, name, f"{name} is seen") for name in names)
+    parts = tuple(Finding(name, f"{name} is seen", name, 0.2) for name in names)
     return Diagnosis("room", "+".join(names), parts, (), ())
 
 

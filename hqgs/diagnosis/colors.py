@@ -191,7 +191,6 @@ class DeviceSigns:
     vignetting: float
     response: float
     unbounded: tuple[float, float]  # of both, where they may be what no lens and no sensor does
-    corner: float  # the most that a lens keeps from a corner
 
 
 def grouped(views: Sequence[View]) -> Numbers:
@@ -236,13 +235,12 @@ def device_signs(views: Sequence[View], shared: SharedColors) -> DeviceSigns | N
     vignetting = as_a_lens(table.fit(every, "v")[:, :2].mean(2))
     found = _as_cameras(table.fit(every, last), counts)
     response = found[:, 2:] - (counts[:, None, None] * found[:, 2:]).sum(0) / counts.sum()
-    corner = 1 - np.exp(-vignetting.sum(1)).min()
     darker, bent = (
         tuple((errors[one, bound] - errors[other, bound]) / base for bound in (True, False))
         for one, other in (("", "v"), ("v", last))
     )
     devices = Devices(of_photo, vignetting, response)
-    return DeviceSigns(devices, darker[0], bent[0], (darker[1], bent[1]), float(corner))
+    return DeviceSigns(devices, darker[0], bent[0], (darker[1], bent[1]))
 
 
 def _as_cameras(found: Floats, counts: Numbers) -> Floats:
@@ -367,22 +365,22 @@ def _within(values: Floats, photo: Numbers, point: Numbers, weights: Floats) -> 
 def exposure_finding(log_gains: NDArray[np.float64] | None, photos: Sequence[PhotoDiagnosis]) -> Finding:
     """`log_gains` [N, 3], as `hqgs.diagnosis.colors` tells them."""
     if log_gains is None:
-        return Finding("exposure", False, None, None, None, "the photos share too few points to tell")
+        return Finding("exposure", "the photos share too few points to tell")
     spread = float(np.std(log_gains, axis=0).max())
     reason = f"gains differ by {spread:.1%} from photo to photo"
     # Noise that black and white cut off brightens the dark parts of a photo, and darkens the bright ones.
     noises = [noise for photo in photos if (noise := photo.told_noise) is not None]
     least = UNLIKE_GAINS + (0.5 * max(noises) / 255 if noises else 0.0)
     if spread < least:
-        return Finding("exposure", False, spread, None, None, f"{reason} (needed from {least:.0%})")
-    return Finding("exposure", True, spread, None, "exposure", reason)
+        return Finding("exposure", f"{reason} (needed from {least:.0%})", None, spread)
+    return Finding("exposure", reason, "exposure", spread)
 
 
 def device_findings(signs: DeviceSigns | None) -> tuple[Finding, Finding]:
     """Vignetting and response."""
     if signs is None:
         why = "no camera is told to have taken enough of the photos"
-        vignetting, response = (Finding(name, False, None, None, None, why) for name in DEVICES)
+        vignetting, response = (Finding(name, why) for name in DEVICES)
         return vignetting, response
     found: list[Finding] = []
     for name, less, more in zip(DEVICES, (signs.vignetting, signs.response), signs.unbounded, strict=True):
@@ -393,5 +391,5 @@ def device_findings(signs: DeviceSigns | None) -> tuple[Finding, Finding]:
             needed = False
             reason = f"what would let photos agree better by {more:.1%} {NO_CAMERA[name]}; it counts as light"
             reason += " that changes, a flash or reflections"
-        found.append(Finding(name, needed, less, None, name if needed else None, reason))
+        found.append(Finding(name, reason, name if needed else None, less))
     return found[0], found[1]

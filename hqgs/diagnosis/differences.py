@@ -169,9 +169,9 @@ def _directions(photo: NDArray[Any]) -> NDArray[np.float64]:
 def shake_finding(scene: Scene) -> Finding:
     unlike = unlike_sharpness(scene)
     if unlike is None:
-        return Finding("shake", False, None, None, None, "the photos are too few or too small to tell")
+        return Finding("shake", "the photos are too few or too small to tell")
     reason = f"photos differ by {unlike.sharpness:.2f} in sharpness, by {unlike.direction:.2f} in direction"
     if unlike.sharpness < UNLIKE or unlike.direction < TURNED:
         reason += f" (needed from {UNLIKE:g} and {TURNED:g} in the logarithm of the power of fine details)"
-        return Finding("shake", False, unlike.sharpness, None, None, reason)
-    return Finding("shake", True, unlike.sharpness, None, "shake", reason)
+        return Finding("shake", reason, None, unlike.sharpness)
+    return Finding("shake", reason, "shake", unlike.sharpness)

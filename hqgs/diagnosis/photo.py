@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +26,15 @@ ROUNDING_ONLY: Table = ((1,) * 8,) * 8
 class Finding:
     """One step of how the photos were made, and whether the method must undo it."""
 
-    name: str  # "exposure", "shake", "focus", "blur", "lowres", "noise", "jpeg" or "video"
-    needed: bool
-    value: float | None  # median over photos: px, factor, levels or quality; None: not told
-    spread: float | None  # robust standard deviation over photos; None: estimated from all of them together
-    step: str | None  # in the grammar of `parse_formation`, where needed
+    name: str  # of its kind (`KINDS`)
     reason: str  # one sentence
+    step: str | None = None  # in the grammar of `parse_formation`; None: nothing must be undone
+    value: float | None = None  # median over photos: px, factor, levels or quality; None: not told
+    spread: float | None = None  # robust standard deviation over photos; None: estimated from all together
+    needed: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "needed", self.step is not None)
 
 
 @dataclass(frozen=True)

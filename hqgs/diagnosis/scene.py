@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ BAD_QUALITY, VISIBLE_QUALITY = 25, 85
 COARSE_FILM = 0.24
 
 
+T = TypeVar("T")
 _HEAD = ("photo", "size", "enlarged", "jpeg", "blocking", "noise", "blur")
 
 
@@ -82,39 +84,36 @@ class Inspector:
 
     def __init__(self, on_stage: OnStage = silent) -> None:
         self.on_stage: OnStage = on_stage
-        # By identity, with the views, so that no other can come to have it.
-        self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
-        self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
-        self._differences: dict[tuple[int, ...], tuple[Finding, ...]] = {}
-        self._gains: dict[tuple[int, ...], tuple[NDArray[np.float64] | None, DeviceSigns | None]] = {}
+        self._known: dict[tuple[Any, ...], tuple[Sequence[object], Any]] = {}
         self.last: Diagnosis | None = None  # that was made
+
+    def _once(self, make: Callable[[], T], what: object, of: Sequence[object]) -> T:
+        """What `make` makes of things, by their identity; they are kept beside it: no others get it."""
+        key = what, *map(id, of)
+        if key not in self._known:
+            self._known[key] = of, make()
+        return self._known[key][1]
 
     def inspect(self, view: View, enlargement: Enlargement | None = None) -> Inspected:
         """`inspect_photo` of a view; `enlargement` where it is known."""
-        key = id(view), enlargement
-        if key not in self._inspected:
-            found = inspect_photo(view.name, view.image, view.low, enlargement=enlargement, film=view.film)
-            self._inspected[key] = view, found
-        return self._inspected[key][1]
+        given = view.name, view.image, view.low, enlargement, view.film
+        return self._once(lambda: inspect_photo(*given), enlargement, [view])
 
     def log_gains(self, scene: Scene) -> NDArray[np.float64] | None:
         """`hqgs.diagnosis.colors.log_gains` of the training photos."""
-        return self._told_by_colors(scene)[0]
+        return self._by_colors(scene)[0]
 
     def device_signs(self, scene: Scene) -> DeviceSigns | None:
         """`hqgs.diagnosis.colors.device_signs` of the training photos."""
-        return self._told_by_colors(scene)[1]
+        return self._by_colors(scene)[1]
 
-    def _told_by_colors(self, scene: Scene) -> tuple[NDArray[np.float64] | None, DeviceSigns | None]:
-        key = tuple(map(id, scene.train))
-        if key not in self._gains:
-            shared = shared_colors(scene)
-            self._gains[key] = (
-                (None, None)
-                if shared is None
-                else (log_gains(scene, shared), device_signs(scene.train, shared))
-            )
-        return self._gains[key]
+    def _by_colors(self, scene: Scene) -> tuple[NDArray[np.float64] | None, DeviceSigns | None]:
+        def told() -> tuple[NDArray[np.float64] | None, DeviceSigns | None]:
+            if (shared := shared_colors(scene)) is None:
+                return None, None
+            return log_gains(scene, shared), device_signs(scene.train, shared)
+
+        return self._once(told, "colors", scene.train)
 
     def diagnose(self, scene: Scene, max_photos: int = 16) -> Diagnosis:
         """As `diagnose_scene`."""
@@ -136,24 +135,16 @@ class Inspector:
                     taken += 1
             found.append(self.inspect(view, known))
             self.on_stage(Stage("photos diagnosed", len(found), len(chosen)))
-        key = tuple(map(id, found))
-        if key not in self._concluded:
-            self._concluded[key] = tuple(conclude(found))
-        photos = self._concluded[key]
-        everyone = tuple(map(id, scene.train))
-        if everyone not in self._differences:
-            shake = shake_finding(scene)
-            exposure = exposure_finding(self.log_gains(scene), photos)
-            devices = device_findings(self.device_signs(scene))
-            self._differences[everyone] = exposure, *devices, shake, focus_finding(scene, shake.needed)
-        own, film = self._differences[everyone], _video(photos)
+        photos = self._once(lambda: tuple(conclude(found)), "photos", found)
+        own = self._once(lambda: self._own(scene, photos), "own", scene.train)
+        film = _video(photos)
         if film.needed:
             own = *own[:-2], *(_by_codec(part) for part in own[-2:])
         *_, shake, focus = own
         blur = _blur(photos)
         if unlike := [part.name for part in (shake, focus) if part.needed]:
             reason = f"each photo has its own, see {' and '.join(unlike)}"
-            blur = replace(blur, needed=False, step=None, reason=reason)
+            blur = replace(blur, step=None, reason=reason)
         faults = blur, _lowres(photos), _noise(photos)
         jpeg = _jpeg(photos, alone=not any(part.needed for part in (*faults, film)))
         parts = (*own, *faults, jpeg, film)
@@ -161,6 +152,13 @@ class Inspector:
         passed_over = _passed_over(scene.of or len(scene.train), len(photos), taken)
         self.last = Diagnosis(scene.name, str(parse_formation(text)), parts, photos, passed_over)
         return self.last
+
+    def _own(self, scene: Scene, photos: Sequence[PhotoDiagnosis]) -> tuple[Finding, ...]:
+        """What photos and cameras have of their own."""
+        shake = shake_finding(scene)
+        exposure = exposure_finding(self.log_gains(scene), photos)
+        devices = device_findings(self.device_signs(scene))
+        return exposure, *devices, shake, focus_finding(scene, shake.needed)
 
 
 def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
@@ -197,56 +195,55 @@ def _lowres(photos: Sequence[PhotoDiagnosis]) -> Finding:
     of = f"{count} of {len(photos)} photos"
     if factor == 1 or 2 * count <= len(photos):
         reason = f"{len(photos) - factors.count(1)} of {len(photos)} photos show the grid of an enlargement"
-        return Finding("lowres", False, 1.0, _spread_of(factors), None, reason)
+        return Finding("lowres", reason, None, 1.0, _spread_of(factors))
     small = next(photo.enlargement for photo in photos if photo.enlargement.factor == factor)
     size = f"{small.width} x {small.height}"
     at_hand = f"the small photos of about {size} px are at hand"
     how = at_hand if known else f"{of} show the grid of smaller pixels"
-    return Finding(
-        "lowres", True, float(factor), _spread_of(factors), f"lowres:{factor}", f"enlarged by {factor}: {how}"
-    )
+    reason = f"enlarged by {factor}: {how}"
+    return Finding("lowres", reason, f"lowres:{factor}", float(factor), _spread_of(factors))
 
 
 def _jpeg(photos: Sequence[PhotoDiagnosis], alone: bool) -> Finding:
     qualities = [photo.jpeg.quality for photo in photos if photo.jpeg.quality is not None]
     of = f"{len(qualities)} of {len(photos)} photos show quantised coefficients"
     if 2 * len(qualities) <= len(photos):
-        return Finding("jpeg", False, None, None, None, of)
+        return Finding("jpeg", of)
     quality = float(np.median(qualities))
     spread = _spread_of(qualities)
     limit = BAD_QUALITY if alone else VISIBLE_QUALITY
     if quality >= limit:
         reason = f"quality {quality:.0f} is good enough to take the photos as they are (needed below {limit})"
-        return Finding("jpeg", False, quality, spread, None, reason)
+        return Finding("jpeg", reason, None, quality, spread)
     (row, column), _ = Counter(photo.jpeg.phase for photo in photos if photo.jpeg.quality).most_common(1)[0]
     if (row, column) != (0, 0):
         reason = f"{of}, but from row {row} and column {column} on: cropped since, which no step can say"
-        return Finding("jpeg", False, quality, spread, None, reason)
-    return Finding("jpeg", True, quality, spread, f"jpeg:{quality:.0f}", f"{of} of quality {quality:.0f}")
+        return Finding("jpeg", reason, None, quality, spread)
+    return Finding("jpeg", f"{of} of quality {quality:.0f}", f"jpeg:{quality:.0f}", quality, spread)
 
 
 def _video(photos: Sequence[PhotoDiagnosis]) -> Finding:
     details = [photo.film for photo in photos if photo.film is not None]
     reason = f"{len(details)} of {len(photos)} photos are told to be frames of a film"
     if 2 * len(details) <= len(photos):
-        return Finding("video", False, None, None, None, reason)
+        return Finding("video", reason)
     detail, spread = float(np.median(details)), _spread_of(details)
     reason += f"; as decoded, the finest details are {detail:.2f} times as strong as coarser ones"
-    if detail >= COARSE_FILM:
-        return Finding("video", False, detail, spread, None, f"{reason} (needed below {COARSE_FILM:g})")
-    return Finding("video", True, detail, spread, "video", reason)
+    coarse = detail < COARSE_FILM
+    reason += "" if coarse else f" (needed below {COARSE_FILM:g})"
+    return Finding("video", reason, "video" if coarse else None, detail, spread)
 
 
 def _by_codec(unlike: Finding) -> Finding:
     """Shake or focus of a coarse film, whose codec takes more of some frames than of others."""
     reason = f"{unlike.reason}; in a coarse film its codec does that"
-    return replace(unlike, needed=False, step=None, reason=reason) if unlike.needed else unlike
+    return replace(unlike, step=None, reason=reason) if unlike.needed else unlike
 
 
 def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
     known = [(photo.noise, photo.noise_limit) for photo in photos if photo.noise is not None]
     if not known:
-        return Finding("noise", False, None, None, None, "the photos are too small or too clipped to tell")
+        return Finding("noise", "the photos are too small or too clipped to tell")
     level, limit = (float(value) for value in np.median(known, axis=0))
     spread = None if _pooled(photos) else _spread_of([noise for noise, _ in known])
     noisy = sum(photo.told_noise is not None for photo in photos)
@@ -259,20 +256,20 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
     # times the noise of the quieter photos in the noisier ones: each has its own
     if spread is not None and noisy > 0.1 * len(known) and loud >= 2.5 * quiet:
         reason = f"{kind} {quiet:.1f} levels in some photos and {loud:.1f} in others{more}"
-        return Finding("noise", True, level, spread, "grain", reason)
+        return Finding("noise", reason, "grain", level, spread)
     if level >= limit:
-        return Finding("noise", True, level, spread, f"noise:{level:.0f}", f"{kind} {level:.1f} levels{more}")
+        return Finding("noise", f"{kind} {level:.1f} levels{more}", f"noise:{level:.0f}", level, spread)
     if spread is None:
         reason = f"below {limit:.0f} levels the JPEG hides it, and no more than that is seen"
     else:
         reason = f"{level:.1f} levels could be fine texture (needed from {limit:g})"
-    return Finding("noise", False, level, spread, None, reason)
+    return Finding("noise", reason, None, level, spread)
 
 
 def _blur(photos: Sequence[PhotoDiagnosis]) -> Finding:
     blurs = [photo.blur for photo in photos if photo.blur is not None]
     if not blurs:
-        return Finding("blur", False, None, None, None, "the photos are too small to tell")
+        return Finding("blur", "the photos are too small to tell")
     sigma = float(np.median([blur.sigma for blur in blurs]))
     least = float(np.median([photo.blur_limit for photo in photos]))
     kind, count = Counter(blur.kind for blur in blurs).most_common(1)[0]
@@ -284,16 +281,15 @@ def _blur(photos: Sequence[PhotoDiagnosis]) -> Finding:
         blurred = sum(blur.sigma >= least for blur in blurs)
         reason = f"sigma {sigma:.1f} px is within what sharp photos show (needed from {least:.1f} px)"
         reason += f"; {blurred} of {len(blurs)} photos are blurred" if blurred else ""
-        return Finding("blur", False, sigma, spread, None, reason)
+        return Finding("blur", reason, None, sigma, spread)
     name, unit = {
         "gaussian": ("blur", "sigma"),
         "defocus": ("defocus", "radius"),
         "motion": ("motion", "length"),
     }[kind]
     step = f"{name}:{within(KINDS[name], round(amount, 1)):g}"  # enlarged ones may have more
-    return Finding(
-        "blur", True, amount, spread, step, f"the spectra fall as after {kind} blur of {unit} {amount:.1f} px"
-    )
+    reason = f"the spectra fall as after {kind} blur of {unit} {amount:.1f} px"
+    return Finding("blur", reason, step, amount, spread)
 
 
 def _correlation(photos: Sequence[PhotoDiagnosis]) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from hqgs.base.files import LEARNED
-from hqgs.evaluation.learned import learned_picture
+from hqgs.evaluation.looks import learned_picture
 from hqgs.evaluation.records import LearnedRecord
 from hqgs.evaluation.verdict import overdone
 from hqgs.training.methods.cameras import LearnedCamera

@@ -56,8 +56,7 @@ class Prepared:
             facts = replace(facts, looks=tried_looks(scene, settings, begin, inspector.on_stage))
             settings = plan_run(facts, self.diagnosis, asked).settings
         self.facts: Facts = facts
-        self._inspector: Inspector = inspector
-        self.form(settings)
+        self.form(settings, inspector)
         # Of more photos, where the method asks for it.
         self.shown_diagnosis: Diagnosis | None = inspector.last
         self._on_stage = inspector.on_stage
@@ -65,9 +64,9 @@ class Prepared:
         self._begin: Begin | None = begin
         self._has_tried: bool = False
 
-    def form(self, settings: TrainConfig) -> None:
+    def form(self, settings: TrainConfig, inspector: Inspector) -> None:
         """Make the method of these settings, which has learned nothing, and what renders are compared to."""
-        self.method: Method[Any] = make_method(self.scene, settings, self._inspector)
+        self.method: Method[Any] = make_method(self.scene, settings, inspector)
         self.training_views: TrainingViews = TrainingViews(self.scene.train, self.method, settings.background)
         self.facts = self.method.facts(self.facts, self.training_views.targets)
 

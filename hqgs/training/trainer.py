@@ -68,7 +68,8 @@ class Trainer:
 
     def begin(self, plan: RunPlan) -> None:
         """Stand before the first step of a run of this plan, with a method that has learned nothing."""
-        self.prepared.form(plan.settings)
+        if self.iteration or plan.settings.hqgs.formation != self.config.hqgs.formation:
+            self.prepared.form(plan.settings, Inspector())
         self._stand(plan)
 
     def _stand(self, plan: RunPlan) -> None:

@@ -15,7 +15,7 @@ both says nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -208,8 +208,12 @@ class LearnedCameras:
         ]
 
     def param_groups(self) -> list[dict[str, Any]]:
-        groups = groups_of({"paths": self._paths, "lenses": self._lenses, "gains": self._gains})
-        return groups + ([] if self._devices is None else self._devices.param_groups())
+        names = {"path": "paths", "lens": "lenses"}
+        return [
+            {"name": names.get(name, name), "params": params, "lr": 0.0, "betas": (0.9, 0.99)}
+            for name, params in self._named().items()
+            if params
+        ]
 
     def rates(self, part: float) -> dict[str, float]:
         """Learning rates after this part of the run."""
@@ -220,23 +224,24 @@ class LearnedCameras:
 
     def state_dict(self) -> dict[str, Tensor]:
         state = {"visits": self._visits, "still": self._still, "sharp": self._sharp}
-        state |= {"active": torch.tensor(self._active)} | state_of(self._named())
-        if self._devices is not None:
-            state |= self._devices.state_dict()
+        state |= {"active": torch.tensor(self._active)}
+        state |= {f"{name}.{k}": v.detach() for name, of in self._named().items() for k, v in enumerate(of)}
         return state | {f"near.{k}": near for k, near in enumerate(self._nearness) if near is not None}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self._visits = state["visits"].clone()
         self._still, self._sharp = state["still"].clone(), state["sharp"].clone()
         self._active = bool(state["active"])
-        load_into(self._named(), state)
-        if self._devices is not None:
-            self._devices.load_state_dict(state)
+        with torch.no_grad():
+            for name, values in self._named().items():
+                for k, value in enumerate(values):
+                    value.copy_(state[f"{name}.{k}"])
         self._nearness = [state.get(f"near.{k}") for k in range(len(self._nearness))]
 
     def _named(self) -> dict[str, list[Tensor]]:
-        """What is trained of each photo's camera, as a checkpoint names it."""
-        return {"path": self._paths, "lens": self._lenses, "gains": self._gains}
+        """What is trained, as a checkpoint names it."""
+        own = {"path": self._paths, "lens": self._lenses, "gains": self._gains}
+        return own if self._devices is None else own | self._devices.named()
 
     def _own_gains(self, number: int) -> Tensor:
         """Of the photo of this number, [3]."""
@@ -394,16 +399,8 @@ class LearnedDevices:
             response = self._response[device].detach().numpy().copy()
         return vignetting, response
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        return groups_of(self._named())
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return state_of(self._named())
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        load_into(self._named(), state)
-
-    def _named(self) -> dict[str, list[Tensor]]:
+    def named(self) -> dict[str, list[Tensor]]:
+        """What is trained."""
         return {"vignetting": self._vignetting, "response": self._response}
 
 
@@ -412,28 +409,6 @@ def _squares(height: int, width: int, center: tuple[float, float], dtype: torch.
     K = np.eye(3)
     K[:2, 2] = center
     return torch.from_numpy(squared_radii(height, width, K)).to(dtype)
-
-
-def groups_of(named: Mapping[str, list[Tensor]]) -> list[dict[str, Any]]:
-    """Groups of an optimizer, of the tensors that are trained under each name; none where there are none."""
-    return [
-        {"name": name, "params": params, "lr": 0.0, "betas": (0.9, 0.99)}
-        for name, params in named.items()
-        if params
-    ]
-
-
-def state_of(named: Mapping[str, list[Tensor]]) -> dict[str, Tensor]:
-    """The tensors as a checkpoint names them."""
-    return {f"{name}.{k}": value.detach() for name, values in named.items() for k, value in enumerate(values)}
-
-
-@torch.no_grad()
-def load_into(named: Mapping[str, list[Tensor]], state: dict[str, Tensor]) -> None:
-    """The values of `state_of` into these tensors."""
-    for name, values in named.items():
-        for k, value in enumerate(values):
-            value.copy_(state[f"{name}.{k}"])
 
 
 def _trained(values: Iterable[NDArray[np.float64]]) -> list[Tensor]:
