@@ -106,7 +106,8 @@ def test_short_runs_are_judged_by_photos_that_they_have_not_seen() -> None:
 
 
 def test_a_trial_ends_where_its_first_photos_all_lose_without_growth(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trial, "PIXELS", 2 * GAUSSIAN)  # a run that grows has fewer than one that does not
+    monkeypatch.setattr(trial, "PIXELS", 10 * GAUSSIAN)  # a run that grows has fewer than one that does not
+    monkeypatch.setitem(globals(), "GAUSSIAN", 10)
     scene, seen = tiny_scene(12), list[Scene]()
     plan = RunPlan(replace(ASKED, iterations=10**6), FIRST, True, True, 0, 0, 0)
     found = trial.tried_growth(scene, plan, lambda *of: seen.append(of[0]) or FakeRun(*of))  # type: ignore[arg-type]

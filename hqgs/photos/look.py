@@ -38,7 +38,8 @@ class Look:
     @property
     def changes(self) -> bool:
         """Whether it is another than that of the scene."""
-        return bool((self.gains != 1).any() or self.vignetting.any() or self.response.any())
+        gains = np.abs(np.log(self.gains)).max() > 1e-9
+        return bool(gains or self.vignetting.any() or self.response.any())
 
     def of(self, image: NDArray[Any], K: NDArray[np.float64]) -> NDArray[np.float64]:
         """A picture [H, W, 3], values of sRGB, in this look; `K` [3, 3] has the axis, px."""
