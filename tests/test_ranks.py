@@ -196,9 +196,8 @@ def test_gradients_are_those_of_the_mean_of_the_losses() -> None:
     training = TrainingViews(scene.train, ThreeDGS(), config.background)
     parts, rests = list[Part](), list[Rest]()
     for plan in plans:
-        forward = training.at(plan, to_rasterize(gaussians, gaussians))
-        optimizer.zero_grad()
-        assert forward.backward(gaussians, optimizer) is None
+        forward = training.at(plan, to_rasterize(gaussians, gaussians), 0)
+        assert forward.backward(trainer.state) is None
         assert gaussians.shN.grad is None  # it is made of sh0's
         part, rest = part_of(forward, None, gaussians, optimizer)
         m, bits = len(part.rows), len(gaussians) / 8
@@ -213,7 +212,7 @@ def test_gradients_are_those_of_the_mean_of_the_losses() -> None:
     assert set(give_others(parts, rests, gaussians, optimizer).values()) == {4}
     ours = {name: tensor.grad for name, tensor in gaussians.named().items()}
     optimizer.zero_grad()
-    torch.stack([training.at(plan, gaussians).loss for plan in plans]).mean().backward()
+    torch.stack([training.at(plan, gaussians, 0).loss for plan in plans]).mean().backward()
     for name, tensor in gaussians.named().items():
         expected, got = tensor.grad, ours[name]
         assert expected is not None
