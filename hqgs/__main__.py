@@ -1,10 +1,14 @@
 """`python -m hqgs`, and what the installed command `hqgs` calls."""
 
+import io
 import sys
 
 
 def run() -> int:
     """The command line's exit code, also where Ctrl-C comes while it is being loaded."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")  # a path that the console's encoding cannot show
     try:
         from hqgs.cli.main import main
 

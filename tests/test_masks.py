@@ -119,6 +119,11 @@ def test_photos_that_are_called_like_masks_stay() -> None:
     assert masks_among(names) == {"2_mask.jpg", "masks/2.png"}
 
 
+def test_a_mask_whose_photo_is_gone_is_no_photo() -> None:
+    names = ["1.jpg", "1.jpg.mask.png", "2.jpg", "2.jpg.mask.png", "3.jpg.mask.png", "mask_4.png"]
+    assert masks_among(names) == {"1.jpg.mask.png", "2.jpg.mask.png", "3.jpg.mask.png"}
+
+
 def scene_turned(root: Path, orientation: int, shown: bool, size: tuple[int, int]) -> Truth:
     """A model for photos as they are stored; a bright thing in the dark, and its mask as a tool makes it of
     the photo upright (Pillow's `exif_transpose`), or as it is stored."""

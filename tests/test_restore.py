@@ -25,7 +25,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 import hqgs
 import hqgs.scene.restore
 from hqgs.photos.resize import resize
-from hqgs.scene.restore import RestoreConfig, restore_scene
+from hqgs.scene.restore import restore_scene
 from hqgs.scene.scene import Camera, Scene, View
 
 pytest.importorskip("spandrel")  # an optional package
@@ -33,7 +33,7 @@ import spandrel
 from spandrel.architectures.Compact import Compact
 from spandrel.architectures.DnCNN import DnCNN
 
-WHOLE = RestoreConfig(tile=10_000)
+WHOLE = 10_000  # px of a tile
 
 
 def weights_of(model: torch.nn.Module, seed: int | None = None) -> dict[str, Tensor]:
@@ -169,9 +169,9 @@ def test_tiles_leave_no_seam(tmp_path: Path, scale: int) -> None:
     scene = scene_of(photo(61 * scale, 90 * scale, 1), low=photo(61, 90))
     path = saved(tmp_path, compact(scale, seed=3))
     (whole,) = restore_scene(scene, path, WHOLE).train
-    (tiles,) = restore_scene(scene, path, RestoreConfig(tile=16, overlap=4)).train
+    (tiles,) = restore_scene(scene, path, 16, 4).train
     np.testing.assert_allclose(tiles.image, whole.image, rtol=0, atol=1e-6)
-    (narrow,) = restore_scene(scene, path, RestoreConfig(tile=16, overlap=0)).train
+    (narrow,) = restore_scene(scene, path, 16, 0).train
     assert np.abs(narrow.image - whole.image).max() > 1e-3  # the network does look beyond a tile
 
 
@@ -221,7 +221,7 @@ def test_tiles_start_where_the_network_wants_them(tmp_path: Path, monkeypatch: p
     model = know_blocks(monkeypatch)
     image = photo(40, 112) * 1.6 - 0.3  # clipped before the network sees it
     scene = scene_of(image)
-    (view,) = restore_scene(scene, saved(tmp_path, BLOCKS), RestoreConfig(tile=21, overlap=3)).train
+    (view,) = restore_scene(scene, saved(tmp_path, BLOCKS), 21, 3).train
     assert len(model.sizes) == 2 * 5  # 40 = 24 + 16, 112 = 4 x 24 + 16
     expected = image.clip(0, 1).reshape(5, 8, 14, 8, 3).mean((1, 3)).repeat(8, 0).repeat(8, 1)
     np.testing.assert_allclose(view.image, expected, rtol=0, atol=1e-6)
@@ -239,7 +239,7 @@ def test_what_a_network_says_of_tiles_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiling: spandrel.ModelTiling, tiles: int
 ) -> None:
     model = know_blocks(monkeypatch, tiling=tiling)
-    restore_scene(scene_of(photo(40, 112)), saved(tmp_path, BLOCKS), RestoreConfig(tile=21, overlap=3))
+    restore_scene(scene_of(photo(40, 112)), saved(tmp_path, BLOCKS), 21, 3)
     assert len(model.sizes) == tiles
 
 
@@ -269,7 +269,7 @@ def test_no_tile_is_larger_than_asked(tmp_path: Path, monkeypatch: pytest.Monkey
         return forward(self, x)
 
     monkeypatch.setattr(Compact, "forward", spy)
-    restore_scene(scene_of(photo(50, 70)), saved(tmp_path, compact()), RestoreConfig(tile=20, overlap=3))
+    restore_scene(scene_of(photo(50, 70)), saved(tmp_path, compact()), 20, 3)
     assert len(sizes) == 3 * 4
     assert max(h for _, _, h, _ in sizes) <= 26
     assert max(w for _, _, _, w in sizes) <= 26
@@ -384,10 +384,3 @@ def test_without_spandrel_it_says_how_to_get_it(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'hqgs\[restore\]'"):
         restore_scene(tiny_scene(), saved(tmp_path, compact()))
-
-
-def test_wrong_values_are_named() -> None:
-    with pytest.raises(ValueError, match="tile is 0"):
-        RestoreConfig(tile=0)
-    with pytest.raises(ValueError, match="overlap is -1"):
-        RestoreConfig(overlap=-1)

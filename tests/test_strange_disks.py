@@ -7,6 +7,8 @@ import fcntl
 import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -166,3 +168,14 @@ def test_what_says_that_a_disk_is_full_or_broken_is_still_raised(
     with pytest.raises(OSError, match="input/output"), atomic_path(tmp_path / "a") as tmp:
         tmp.write_text("a")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8:strict", "cp1252"])
+def test_a_console_that_cannot_show_a_path(tmp_path: Path, encoding: str) -> None:
+    folder = tmp_path / "Jos\udce9 \u1234"
+    folder.mkdir()
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    command = [sys.executable, "-m", "hqgs", "info", folder]
+    told = subprocess.run(command, capture_output=True, env=environment, check=False)
+    assert told.returncode == 2
+    assert b"is empty: give a folder with photos" in told.stderr

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import cached_property
 from itertools import chain
@@ -26,7 +27,7 @@ _NO_PHOTOS = re.compile(
     r"(depths?|confidence|normals?|masks?|segmentations?|semantics?|labels|thumb(nail)?s)([_-]?(maps?|images?))?",
     re.IGNORECASE,
 )
-_MARKED = re.compile(r"masks?[._ -](?P<after>.+)|(?P<before>.+)[._ -]masks?", re.IGNORECASE)
+_MARKED = re.compile(r"^(masks?[._ -])(.+)$|^(.+?)([._ -]masks?)$", re.IGNORECASE)  # of a mask's stem
 Key = tuple[str, ...]
 
 
@@ -42,14 +43,16 @@ def of_maps(folder: str) -> bool:
 
 
 def masks_among(names: Iterable[str]) -> set[str]:
-    """Those of relative paths that are masks of others, by their names or a folder of masks."""
+    """Those of relative paths that are masks of others, by their names or a folder of masks.
+
+    Of photos that are gone too, where more masks than those are marked so.
+    """
     names = [*names]
     photos = {key for name in names for key in photo_keys(name)}
-    return {
-        name
-        for name in names
-        if any(key in photos and key not in photo_keys(name) for key in mask_keys(name))
-    }
+    masks = {name for name in names if photos & ({*mask_keys(name)} - {*photo_keys(name)})}
+    marks = {name: _MARKED.sub(r"\1*\4", PurePosixPath(name).stem) for name in names}
+    own, others = Counter(marks[name] for name in masks), Counter(marks[n] for n in names if n not in masks)
+    return masks | {n for n in names if own[marks[n]] > others[marks[n]] and "*" in marks[n]}
 
 
 def is_mask_folder(name: str) -> bool:
@@ -68,7 +71,7 @@ def mask_keys(name: str) -> list[Key]:
     path = PurePosixPath(name.casefold())
     folders = tuple(part for part in path.parent.parts if not is_mask_folder(part))
     marked = _MARKED.fullmatch(path.stem)
-    stems = [] if marked is None else [marked["after"] or marked["before"]]
+    stems = [] if marked is None else [marked[2] or marked[3]]
     if len(folders) < len(path.parent.parts):
         stems += [path.name, path.stem]
     bare = [stem.rpartition(".")[0] for stem in stems if PurePosixPath(stem).suffix in PHOTO_SUFFIXES]

@@ -11,7 +11,8 @@ import struct
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,49 +44,28 @@ NETWORK_ERRORS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class RestoreConfig:
-    """How a photo is cut up for the network; bounds the memory. ValueError for a value out of range."""
-
-    tile: int = 256  # px at the network's input; a photo with a longer side goes through it in tiles
-    overlap: int = 32  # px of the photo around a tile that the network sees too; their output is dropped
-
-    def __post_init__(self) -> None:
-        if self.tile < 1:
-            raise ValueError(f"tile is {self.tile}, wanted at least 1 px")
-        if self.overlap < 0:
-            raise ValueError(f"overlap is {self.overlap}, wanted at least 0 px")
-
-
-DEFAULTS = RestoreConfig()
-
-
-def restore_scene(scene: Scene, weights: str | Path, config: RestoreConfig = DEFAULTS) -> Scene:
+def restore_scene(scene: Scene, weights: str | Path, tile: int = 256, overlap: int = 32) -> Scene:
     """The scene with its training photos as a restoration network gives them back.
 
-    The network sees a photo as it was taken: `View.low` where there is one, else `View.image`, clipped to
-    [0, 1] as such networks want. Its output becomes `image` (in the photo's dtype). Where its size is not
-    the camera's it is resized by antialiased bicubic: a network of scale 4 that sees a photo without
-    `low` gives a picture 4 times too large, which shrinks to the camera's size. `low` stays, because it is
-    the measurement. So do masks, and the held-out views are not touched. `Scene.notes` says what was done.
+    The network, of RGB or grey (which sees each channel), is any that the optional package spandrel knows for
+    denoising, deblurring, JPEG or super-resolution. It sees a photo as it was taken: `View.low` where there
+    is one, else `View.image`, clipped to [0, 1]. Its output becomes `image`, in that one's type, resized by
+    antialiased bicubic where its size is not the camera's. `low`, masks and held-out views stay.
 
-    Any network will do that the optional package spandrel knows: denoising, deblurring, JPEG and
-    super-resolution, with RGB or grey input (a grey network sees each channel). In tiles the result is that
-    of the whole photo if `overlap` covers the network's field of view. A network that advises against tiles
-    gets them four times as large, and one that makes its own gets the whole photo. Photos run in parallel,
-    each on one thread of torch, so that no number of threads changes a bit; the memory grows with the
-    threads.
+    Photos run in parallel, each on one thread of torch, so that no number of threads changes a bit. The
+    result is that of the whole photo where `overlap` covers the network's field of view.
 
     Args:
-        scene: its training photos are restored.
-        weights: .safetensors, or .pth, .pt, .ckpt. Pickled files are read as tensors only: one that holds
-            anything that could run is refused.
-        config: the tiles.
+        weights: .safetensors, or .pth, .pt, .ckpt, which are read as tensors only: one that holds anything
+            that could run is refused.
+        tile: px at the network's input; larger photos go through it in tiles. Four times as many where it
+            advises against tiles; it makes its own where it says so.
+        overlap: px around a tile that it sees too, and whose output is dropped.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: spandrel is missing, the file does not hold a network that fits, or the network fails on
-            a photo, which the message names.
+        ValueError: spandrel is missing, the file holds no network that fits, or the network fails on a
+            photo, which the message names.
     """
     weights = Path(weights)
     started = time.perf_counter()
@@ -96,7 +76,9 @@ def restore_scene(scene: Scene, weights: str | Path, config: RestoreConfig = DEF
         if not hasattr(local, "network"):
             local.network = copy.deepcopy(network)  # some networks keep values of a call in their modules
         try:
-            return replace(view, image=_restored_image(local.network, view, config), film=None, empty=None)
+            return replace(
+                view, image=_restored_image(local.network, view, tile, overlap), film=None, empty=None
+            )
         except NETWORK_ERRORS as error:
             height, width = _as_taken(view).shape[:2]
             raise ValueError(
@@ -181,63 +163,43 @@ def _as_taken(view: View) -> NDArray[np.uint8] | NDArray[np.float32]:
 
 
 def _restored_image(
-    network: _Network, view: View, config: RestoreConfig
+    network: _Network, view: View, tile: int, overlap: int
 ) -> NDArray[np.uint8] | NDArray[np.float32]:
-    photo = _as_taken(view)
-    values = as_floats(photo).clip(0, 1)
-    channels = torch.from_numpy(values).permute(2, 0, 1)[:, None]  # [3, 1, h, w]
+    channels = torch.from_numpy(as_floats(_as_taken(view)).clip(0, 1)).permute(2, 0, 1)[
+        :, None
+    ]  # [3, 1, h, w]
     images = [channels.transpose(0, 1)] if network.input_channels == 3 else list(channels.split(1))
-    out = (
-        torch.cat([_in_tiles(network, image, config) for image in images], dim=1)[0].permute(1, 2, 0).numpy()
-    )
+    restored = torch.cat([_in_tiles(network, image, tile, overlap) for image in images], dim=1)
+    out = restored[0].permute(1, 2, 0).numpy()
     if not np.isfinite(out).all():
         raise ValueError("its output holds NaN or Inf")
     if out.shape != view.image.shape:
         out = resize(out, *view.image.shape[:2]).clip(0, 1)
-    if view.image.dtype == np.uint8:
-        return np.rint(out * 255).astype(np.uint8)
-    return np.ascontiguousarray(out)
+    return np.rint(out * 255).astype(np.uint8) if view.image.dtype == np.uint8 else np.ascontiguousarray(out)
 
 
-def _in_tiles(network: _Network, image: Tensor, config: RestoreConfig) -> Tensor:
-    """[1, C, h, w] to [1, C, h scale, w scale], tile by tile."""
+def _in_tiles(network: _Network, image: Tensor, tile: int, overlap: int) -> Tensor:
+    """[1, C, h, w] to [1, C, h scale, w scale], tile by tile.
+
+    Tiles start at multiples of what the network wants, so that its windows lie as in the whole photo.
+    """
     scale, multiple = network.scale, network.size_requirements.multiple_of
-    height, width = image.shape[2:]
-    # Tiles start at multiples of what the network wants, so that its windows lie as in the whole photo.
-    overlap = _up(config.overlap, multiple)
-    side = _longest_side(network, config)
-    rows, columns = _spans(height, side, multiple), _spans(width, side, multiple)
-    out = torch.empty(1, image.shape[1], height * scale, width * scale)
-    for top, bottom in rows:
-        for left, right in columns:
-            first_row, first_column = max(top - overlap, 0), max(left - overlap, 0)
-            seen = image[:, :, first_row : bottom + overlap, first_column : right + overlap]
-            tile = network(seen.contiguous())
-            wanted = (1, seen.shape[1], seen.shape[2] * scale, seen.shape[3] * scale)
-            if tile.shape != wanted:
-                raise ValueError(f"its output is {list(tile.shape)}, wanted {list(wanted)}")
-            y, x = (top - first_row) * scale, (left - first_column) * scale
-            h, w = (bottom - top) * scale, (right - left) * scale
-            target = out[:, :, top * scale : bottom * scale, left * scale : right * scale]
-            target.copy_(tile[:, :, y : y + h, x : x + w])
+    overlap = -(-overlap // multiple) * multiple
+    tile *= 1 if network.tiling.name == "SUPPORTED" else 4
+    whole = network.tiling.name == "INTERNAL"
+    counts = [1 if whole else -(-length // tile) for length in image.shape[2:]]
+    sides = [
+        -(-length // (n * multiple)) * multiple for length, n in zip(image.shape[2:], counts, strict=True)
+    ]
+    out = torch.empty(1, image.shape[1], *(length * scale for length in image.shape[2:]))
+    for top, left in product(*(range(0, n, side) for n, side in zip(image.shape[2:], sides, strict=True))):
+        y, x = max(top - overlap, 0), max(left - overlap, 0)
+        seen = image[:, :, y : top + sides[0] + overlap, x : left + sides[1] + overlap]
+        made = network(seen.contiguous())
+        wanted = [1, seen.shape[1], seen.shape[2] * scale, seen.shape[3] * scale]
+        if [*made.shape] != wanted:
+            raise ValueError(f"its output is {[*made.shape]}, wanted {wanted}")
+        into = out[:, :, top * scale :, left * scale :][:, :, : sides[0] * scale, : sides[1] * scale]
+        inner = made[:, :, (top - y) * scale :, (left - x) * scale :]
+        into.copy_(inner[:, :, : into.shape[2], : into.shape[3]])
     return out
-
-
-def _longest_side(network: _Network, config: RestoreConfig) -> int | None:
-    """Of a tile, in px; None: the whole photo at once."""
-    from spandrel import ModelTiling
-
-    if network.tiling == ModelTiling.INTERNAL:
-        return None
-    return config.tile if network.tiling == ModelTiling.SUPPORTED else 4 * config.tile
-
-
-def _spans(length: int, side: int | None, multiple: int) -> list[tuple[int, int]]:
-    """`length` px cut into spans of one size, a multiple of `multiple`, that is about `side` at most."""
-    count = 1 if side is None else -(-length // side)
-    step = _up(-(-length // count), multiple)
-    return [(start, min(start + step, length)) for start in range(0, length, step)]
-
-
-def _up(value: int, multiple: int) -> int:
-    return -(-value // multiple) * multiple
