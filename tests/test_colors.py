@@ -285,6 +285,25 @@ def test_16_bits_keep_their_steps(tmp_path: Path, suffix: str, curve: float) -> 
     assert np.abs(decode(path)[0] - np.array([40.0, 180, 60])).max() <= 1
 
 
+@pytest.mark.parametrize(
+    ("chunks", "told"),
+    [
+        ([chunk(b"gAMA", bytes(4)), points(*[0.0] * 8)], "which are none"),
+        ([chunk(b"gAMA", struct.pack(">I", 1)), points(0.3, 0.3, *[0.5] * 6)], "which are none"),
+        ([chunk(b"cICP", bytes([99, 99, 0, 1]))], "unknown primaries (99 of H.273)"),
+        ([chunk(b"iCCP", b"a\0\0not packed")], "a damaged profile"),
+        ([chunk(b"iCCP", b"a\0\0" + zlib.compress(b"no profile"))], "a damaged profile"),
+    ],
+)
+def test_what_says_nothing_is_said(tmp_path: Path, chunks: list[bytes], told: str) -> None:
+    (tmp_path / "a.png").write_bytes(png_of(np.full((8, 8, 3), 100, np.uint8), *chunks))
+    colors = told_colors(tmp_path / "a.png")
+    assert colors is not None
+    assert told in colors.name
+    assert not colors.known
+    assert (decode(tmp_path / "a.png")[0] == 100).all()
+
+
 def test_adobe_rgb_of_a_camera_that_writes_no_profile(tmp_path: Path) -> None:
     """DCF 2.0: ColorSpace is "uncalibrated", and InteroperabilityIndex R03."""
     exif = Image.Exif()

@@ -145,7 +145,7 @@ def scene_turned(root: Path, orientation: int, shown: bool, size: tuple[int, int
             mask.getexif()[0x0112] = orientation
             with Image.open(root / "images" / name) as photo:
                 seen = ImageOps.exif_transpose(photo)
-            mask = seen.convert("L").point(lambda level: 255 * (level > 100))
+            mask = seen.convert("L").point([255 * (level > 100) for level in range(256)])
         mask.save(root / "masks" / f"{name}.mask.png")
     return truth
 

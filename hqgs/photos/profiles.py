@@ -70,12 +70,14 @@ def colors_of(photo: Image.Image, path: Path) -> Colors | None:
             codes = _of_boxes(file.read(_HEAD))
     if isinstance(codes, tuple):
         return colors_of_codes(*codes)
-    if profile := codes or info.get("icc_profile"):
+    if profile := codes or info.get("icc_profile", b""):
         mode, name, same = _looked_into(profile)
         own = photo.mode if photo.mode in ("LAB", "CMYK") else "RGB"
         if mode and (mode not in (own, "L") or (mode == "L" and not _is_grey(photo))):
             return Colors(f"a profile of another kind of pixels ({name})")
         return None if same else Colors(name, profile if mode else b"")
+    if profile is None:  # Pillow found one that it could not unpack
+        return Colors("a damaged profile")
     if nclx := info.get("nclx_profile"):
         return colors_of_codes(nclx["color_primaries"], nclx["transfer_characteristics"])
     if photo.format == "PNG" and "srgb" not in info and ("gamma" in info or "chromaticity" in info):
@@ -93,7 +95,9 @@ def colors_of(photo: Image.Image, path: Path) -> Colors | None:
 
 
 def colors_of_codes(primaries: int, transfer: int) -> Colors | None:
-    """The same of code points of H.273; those that are not known here say nothing."""
+    """The same of code points of H.273, of which 2 says nothing."""
+    if primaries not in (0, 2, *_PRIMARIES):
+        return Colors(f"unknown primaries ({primaries} of H.273)")
     name, points = _PRIMARIES.get(primaries, _PRIMARIES[1])
     if transfer in HDR:
         return Colors(f"{name} with a high dynamic range ({HDR[transfer]})", hdr=(primaries, transfer))
@@ -188,8 +192,10 @@ def _made(name: str, points: tuple[float, ...], curve: tuple[float, ...]) -> Col
     The profile is one of ICC.1:2010, version 4, with what LittleCMS reads of it.
     """
     try:
-        matrix = to_xyz(points)
-    except (ValueError, ZeroDivisionError, np.linalg.LinAlgError):
+        matrix = to_xyz(points) if min(points[1::2]) > 0 else None
+    except np.linalg.LinAlgError:
+        matrix = None
+    if matrix is None or not np.isfinite(matrix).all():
         return Colors(f"{name}, which are none")
     fixed = [round(value * 65536) for value in (*_D50, *matrix.T.ravel(), *curve)]
     if max(map(abs, fixed)) >= 1 << 31:

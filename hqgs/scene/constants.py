@@ -15,7 +15,6 @@ PICTURE_MARGIN = 1.15  # of the half field of view: a Gaussian just outside the 
 # What files may hold.
 MOST_SIDE = 65_535  # px: the largest that a JPEG can have; larger ones come from damaged files
 LARGEST = 1e15  # world units; beyond this, squared distances overflow 32-bit floats
-LENS_SHARES = 1000  # focal lengths and principal points in sides of the photo; damaged files go far beyond
 MOST_FRAMES = 100_000  # of a camera path in a file
 MOST_BYTES = 4e9  # of all photos, where `longest` bounds them; 1,000 of 1600 x 1200 px would be 5.8 GB
 # px: small copies of photos and frames, which tell of axes and of sharpness; cameras for photos that are
@@ -26,15 +25,7 @@ SAME_POSE = 0.5  # px of a run's photos; COLMAP moves them by far more where one
 # From photos on disk to views, and to photos that are stored for COLMAP.
 JPEG_QUALITY = 95
 SMALLEST_SIDE = 8  # px; below this no metric or tile means anything
-MAX_WORKERS, GIVEN_BACK = 4, 10  # photos at their stored size at once; after which freed memory is given back
-DENSER = 2.0  # new pixels a wanted one, along each side, at which a photo is undistorted
-# px of such a grid: positions are computed so far apart; px: where that is exact enough, and a camera that is
-# no farther from a pinhole is one, its photo not resampled.
-LATTICE, EXACT = 8, 0.02
-# Pixels of the photo between samples: where they are farther apart, means come first; and at which it may be
-# decoded: 6000 px go to 1600 by way of 3000.
-FAR_SAMPLES, DENSE_SAMPLES = 1.25, 1.75
-FILM_SHRUNK = 1.5  # times: until then a smaller frame shows as much of the film's codec as at its own size
+MAX_WORKERS = 4  # photos at their stored size at once
 KEPT_SIDE = 800  # px, of the photos beside cameras.json: to look at, not to train
 
 # Where cameras stand, and which way up.
@@ -68,14 +59,6 @@ MOST_WALKED, MOST_KEYS = 400, 24  # cameras that are put in order; that a path g
 LEAP = 10.0  # median steps: south 26, from one side of a house to another; films and walks around up to 7
 TURN_EXTENT = 0.5  # of the cameras' extent: the way that counts as much as a turn of one radian
 
-# Photos that see more than a flat picture holds, and films.
-WIDE = 120.0  # degrees across or up and down that a flat picture shows at most
-FACE_LATTICE = 128  # rays each way that tell which part of a face a photo shows
-FACE_SPAN = 0.1  # of a face's side that what it shows must span: a strip would have no pixels when scaled
-THETAS = 1024  # angles at which a lens is asked whether its picture still grows
-DARK = 12  # of 255: corners outside of the circle that a fisheye throws
-# Frames: what a slow walk needs; matching grows with their square.
-FRAMES_A_SECOND, FRAMES_FEWEST, FRAMES_MOST = 2.0, 30, 90
 SOME_FACTORS = (0.5, 1.5)  # of a `some` step's value: the least and the most
 
 # Similarities between frames.

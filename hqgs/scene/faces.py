@@ -16,7 +16,13 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from hqgs.scene.constants import DARK, FACE_LATTICE, FACE_SPAN, SHOWN, SMALLEST_SIDE, THETAS, WIDE
+from hqgs.scene.constants import SHOWN, SMALLEST_SIDE
+
+WIDE = 120.0  # degrees across or up and down that a flat picture shows at most
+FACE_LATTICE = 128  # rays each way that tell which part of a face a photo shows
+FACE_SPAN = 0.1  # of a face's side that what it shows must span: a strip would have no pixels when scaled
+THETAS = 1024  # angles at which a lens is asked whether its picture still grows
+DARK = 12  # of 255: corners outside of the circle that a fisheye throws
 
 AROUND = "EQUIRECTANGULAR"  # COLMAP's model of photos of 360 x 180 degrees
 # rotations, face from camera: x, y and z of each face in the camera's frame (x right, y down, z forward)

@@ -24,9 +24,12 @@ from hqgs.photos.film_colors import KNEE, as_photo, film_colors
 from hqgs.photos.jpeg import fine_detail
 from hqgs.photos.spherical import projection
 from hqgs.photos.video import FPS, pyav
-from hqgs.scene.constants import COPY_SIDE, FRAMES_A_SECOND, FRAMES_FEWEST, FRAMES_MOST, JPEG_QUALITY
+from hqgs.scene.constants import COPY_SIDE, JPEG_QUALITY
 from hqgs.scene.names import FRAMES, is_room
 from hqgs.scene.photo_files import film_at
+
+# Frames: what a slow walk needs; matching grows with their square.
+FRAMES_A_SECOND, FRAMES_FEWEST, FRAMES_MOST = 2.0, 30, 90
 
 _PICTURES = ("mjpeg", "png", "bmp", "gif", "webp")  # codecs of covers, in films that count no frames
 _WIDEST = 4  # times as wide as high are pixels of a film at most, or as high as wide

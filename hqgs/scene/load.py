@@ -16,7 +16,7 @@ from hqgs.photos import profiles
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size, told_colors
 from hqgs.scene import masks
 from hqgs.scene.axes import with_true_axes
-from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
+from hqgs.scene.capture import Capture, Photo, list_photos, no_points, odd_lenses, photo_folder
 from hqgs.scene.constants import BACKGROUND, COPY_SIDE, MOST_BYTES
 from hqgs.scene.faces import CUBE, around, faces_of
 from hqgs.scene.film import frame_details
@@ -24,7 +24,6 @@ from hqgs.scene.formats.colmap import find_models, find_models_below, half_model
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
-from hqgs.scene.lenses import odd_lenses
 from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.names import existing_folder
 from hqgs.scene.place import cut_outs, located, placed, without_missing, without_poseless, without_strays

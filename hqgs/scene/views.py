@@ -27,22 +27,21 @@ from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
 from hqgs.photos.pixels import oriented
 from hqgs.photos.resize import CUBIC_RADIUS, Pixels, area_downscale
-from hqgs.scene.capture import Photo
-from hqgs.scene.constants import (
-    DENSE_SAMPLES,
-    DENSER,
-    EXACT,
-    FAR_SAMPLES,
-    FILM_SHRUNK,
-    GIVEN_BACK,
-    LATTICE,
-    MAX_WORKERS,
-    SMALLEST_SIDE,
-)
+from hqgs.scene.capture import Photo, check_camera, check_size, fits
+from hqgs.scene.constants import MAX_WORKERS, SMALLEST_SIDE
 from hqgs.scene.faces import AROUND, CUBE, Face, faces_of, lit, projected
 from hqgs.scene.geometry import parts_of
-from hqgs.scene.lenses import check_camera, check_size, fits
 from hqgs.scene.scene import Camera, View
+
+DENSER = 2.0  # new pixels a wanted one, along each side, at which a photo is undistorted
+# px of such a grid: positions are computed so far apart; px: where that is exact enough, and a camera that is
+# no farther from a pinhole is one, its photo not resampled.
+LATTICE, EXACT = 8, 0.02
+# Pixels of the photo between samples: where they are farther apart, means come first; and at which it may be
+# decoded: 6000 px go to 1600 by way of 3000.
+FAR_SAMPLES, DENSE_SAMPLES = 1.25, 1.75
+FILM_SHRUNK = 1.5  # times: until then a smaller frame shows as much of the film's codec as at its own size
+GIVEN_BACK = 10  # photos, after which freed memory is given back
 
 _CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
 _CameraKey = tuple[str, tuple[float, ...], int, int, int, int, str]

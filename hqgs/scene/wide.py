@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.scene.capture import Capture, Photo
-from hqgs.scene.constants import WIDE
-from hqgs.scene.faces import CUBE, Face, face_name, faces_of
+from hqgs.scene.faces import CUBE, WIDE, Face, face_name, faces_of
 
 
 def with_faces(capture: Capture) -> Capture:
