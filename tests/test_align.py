@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hqgs.scene.sfm.align import Similarity, align, camera_centers, refine, rotation_angles
-from hqgs.scene.sfm.tracks import Tracks
+from hqgs.scene.sfm.refine.tracks import Tracks
 
 Floats = NDArray[np.float64]
 TRUE = Similarity(

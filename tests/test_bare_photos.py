@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
@@ -22,16 +23,19 @@ from hqgs.photos.files import UnreadableError, decode, glance
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.load import load_pictures, load_scene
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm import attempt, program
+from hqgs.scene.sfm import passes as all_passes
+from hqgs.scene.sfm import program
 from hqgs.scene.sfm import run as colmap_run
 from hqgs.scene.sfm.align import rotation_angles
-from hqgs.scene.sfm.attempt import Attempt
 from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
-from hqgs.scene.sfm.failure import Pass, what_to_take, why_few, why_lost, why_no_model
+from hqgs.scene.sfm.failure import Outcome, what_to_take, why_few, why_lost, why_no_model
 from hqgs.scene.sfm.likely import film_pairs, likely_pairs
-from hqgs.scene.sfm.run import LARGEST, expected_time
+from hqgs.scene.sfm.passes import PASSES, Attempt, Work, attempts
+from hqgs.scene.sfm.photos_alone import as_stored
+from hqgs.scene.sfm.run import expected_time
 
 ROOT = Path(__file__).parent.parent
+FINE = PASSES[1]
 
 
 def exif(orientation: int = 1, focal_35mm: int = 0, model: str = "") -> Image.Exif:
@@ -149,6 +153,46 @@ def test_photos_have_names_of_their_own_for_colmap(names: list[str], around: boo
             assert abs(int(np.asarray(seen).mean()) - 9 * names.index(photo)) <= 1
 
 
+def test_colmap_sees_large_photos_smaller_and_what_it_finds_is_at_their_stored_size(tmp_path: Path) -> None:
+    ramp = np.repeat(np.linspace(0, 255, 300).astype(np.uint8)[None, :, None], 200, 0).repeat(3, 2)
+    for name, size in (("a.jpg", (300, 200)), ("b.jpg", (200, 300)), ("c.webp", (60, 40))):
+        Image.fromarray(ramp).resize(size).save(tmp_path / name, exif=exif(1, 72), quality=95)
+    found = bare_photos(tmp_path, 1)
+    assert found is not None
+    photos = readable(found)
+    assert photos.guess().sizes == [(300, 200), (200, 300), (60, 40)]
+    guess = photos.guess(100)
+    assert guess.sizes == [(99, 66), (66, 99), (60, 40)]  # 3:2, exactly
+    whole = photos.guess().focals
+    assert guess.focals == pytest.approx([whole[0] * 0.33, whole[1] * 0.33, whole[2]])
+    (tmp_path / "out").mkdir()
+    photos.write(tmp_path / "out", 100)
+    for name, size in (("a.jpg", (99, 66)), ("b.jpg", (66, 99)), ("c.webp.jpg", (60, 40))):
+        with Image.open(tmp_path / "out" / name) as small:
+            assert small.size == size
+            columns = np.asarray(small, float).mean((0, 2))
+        np.testing.assert_allclose(columns, (np.arange(size[0]) + 0.5) / size[0] * 255, atol=4)
+
+    camera = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_RADIAL", width=99, height=66, params=[80, 49.5, 33, 0.1]
+    )
+    model, rng = pycolmap.Reconstruction(), np.random.default_rng(0)
+    model.add_camera_with_trivial_rig(camera)
+    points = rng.uniform([-1, -1, 4], [1, 1, 6], (20, 3))
+    seen = [np.add(camera.img_from_cam(np.add(points, (k, 0, 0))), (0.3, -0.4)) for k in range(2)]
+    for k, xy in enumerate(seen):
+        image = pycolmap.Image(name=f"{k}", keypoints=xy, camera_id=1, image_id=k + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), [k, 0, 0]))
+    for row, point in enumerate(points):
+        model.add_point3D(
+            point, pycolmap.Track([pycolmap.TrackElement(k + 1, row) for k in range(2)]), [0, 0, 0]
+        )
+    as_stored(model, [(300, 200)], 1)
+    assert model.cameras[1].params == pytest.approx([80 * 300 / 99, 150, 100, 0.1])
+    np.testing.assert_allclose([point.xy for point in model.images[2].points2D], seen[1] * 300 / 99)
+    assert model.compute_mean_reprojection_error() == pytest.approx(0.5 * 300 / 99)
+
+
 def test_heic_photos_are_read_or_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     heif = pytest.importorskip("pillow_heif")
     heif.register_heif_opener()
@@ -228,16 +272,16 @@ load_scene(Path({str(folder)!r}), keep_sfm=Path({str(keep)!r}), on_stage=told)
     (left,) = keep.iterdir()
     log = (left / "log.txt").read_text()
     assert log.count("Processed file [") >= 9
-    assert (left / "colmap.db").is_file()
+    assert (left / "fine.db").is_file()
     scene = load_scene(folder, keep_sfm=keep)
     assert [path.name for path in keep.iterdir()] == [left.name[1:]]
     # One run that nothing stopped had other last bits, in some 300: never twice in a row.
     assert any(load_scene(folder).points.tobytes() == scene.points.tobytes() for _ in range(2))
 
 
-def passes(features: int, inliers: list[int], photos: int = 20, registered: int = 0) -> list[Pass]:
-    first = Pass(False, registered, {f"{k}.jpg": features for k in range(photos)}, inliers, inliers)
-    return [first, Pass(True, registered, first.features, inliers, inliers)]
+def passes(features: int, inliers: list[int], photos: int = 20, registered: int = 0) -> list[Outcome]:
+    first = Outcome(False, registered, {f"{k}.jpg": features for k in range(photos)}, inliers, inliers)
+    return [first, Outcome(True, registered, first.features, inliers, inliers)]
 
 
 def test_a_failure_tells_blur_no_overlap_and_too_few_photos_apart() -> None:
@@ -274,7 +318,7 @@ def test_each_lost_photo_is_told_why_and_what_to_take() -> None:
         "f": [99, 80, 3],
         "h": [99, 50, 40],
     }
-    one = Pass(False, 9, features, [], [], best, apart=[["e", "x", "y"]])
+    one = Outcome(False, 9, features, [], [], best, apart=[["e", "x", "y"]])
     lost = {name: why_lost(name, one) for name in "bcdefh"}
     assert lost == {
         "b": "blurred, dark or bare: 40 features, half of the photos have 900",
@@ -328,7 +372,6 @@ def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.Capt
     with LoadingScreen() as screen:
         screen.stage(Stage("COLMAP", 0, 200, text))
     assert capsys.readouterr().err.splitlines() == [text]
-    assert LARGEST == attempt.LARGEST
 
 
 def test_only_listed_pairs_of_a_film_are_matched(photos: list[np.ndarray], tmp_path: Path) -> None:
@@ -346,12 +389,10 @@ def test_only_listed_pairs_of_a_film_are_matched(photos: list[np.ndarray], tmp_p
     given = {"names": np.array(found.names), "photos": np.array(str(work / "photos")), "pairs": pairs}
     given |= {"sizes": np.array(guess.sizes), "focals": np.array(guess.focals)}
     given["camera_of"] = np.array(guess.camera_of)
-    one = Attempt(work, given, 1, tolerant=False)
+    one = Attempt(Work(work, given, 1), FINE)
     one.run()
     assert len(one.facts()["matches"]) == 3
-    import pycolmap
-
-    with pycolmap.Database.open(work / "colmap.db") as db:
+    with pycolmap.Database.open(work / "fine.db") as db:
         numbers = [pycolmap.pair_id_to_image_pair(pair) for pair in db.read_all_matches()[0]]
     assert sorted(numbers) == [(1, 2), (1, 9), (2, 3)]
 
@@ -372,24 +413,12 @@ def work_on(photos: list[np.ndarray], folder: Path) -> dict[str, np.ndarray]:
 def test_photos_rich_in_detail_are_looked_at_coarsely_and_others_finely(
     photos: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import pycolmap
-
-    given = work_on(photos, tmp_path / "a")
-    fine = Attempt(tmp_path / "a", given, 1, tolerant=False)
-    fine.run()
-    poor = Attempt(tmp_path / "a", given, 1, tolerant=False, coarse=True)
-    poor.run()
-    assert not poor.coarse
-    assert poor.facts() == fine.facts()
-    again = Attempt(tmp_path / "a", given, 1, tolerant=False, coarse=True)
-    assert not again._probe(
-        tmp_path / "none", pycolmap.FeatureExtractionOptions()
-    )  # it was interrupted: what is there is fine already
-    monkeypatch.setattr(attempt, "RICH", 20)
-    given = work_on(photos, tmp_path / "b")
-    rich = Attempt(tmp_path / "b", given, 1, tolerant=False, coarse=True)
-    rich.run()
-    assert rich.coarse
+    work = Work(tmp_path / "a", work_on(photos, tmp_path / "a"), 1)
+    assert not work.rich()
+    (fine,) = attempts(work)
+    monkeypatch.setattr(all_passes, "RICH", 20)
+    (rich,) = attempts(Work(tmp_path / "b", work_on(photos, tmp_path / "b"), 1))
+    assert [fine.one.name, rich.one.name] == ["fine", "coarse"]
     counts = [sum(one.facts()["features"].values()) for one in (rich, fine)]
     assert counts[0] < 0.6 * counts[1]
 
@@ -397,8 +426,8 @@ def test_photos_rich_in_detail_are_looked_at_coarsely_and_others_finely(
 def test_photos_that_coarse_features_do_not_place_are_looked_at_finely(
     photos: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(attempt, "RICH", 0)
-    monkeypatch.setattr(attempt, "COARSE", 3)  # features, which place nothing
+    monkeypatch.setattr(all_passes, "RICH", 0)
+    monkeypatch.setattr(all_passes, "COARSE", 3)  # features, which place nothing
     work_on(photos, tmp_path)
     program.reconstruct(tmp_path, 2)
     (only,) = json.loads((tmp_path / "facts.json").read_text())["passes"]
@@ -407,10 +436,21 @@ def test_photos_that_coarse_features_do_not_place_are_looked_at_finely(
     assert min(only["features"].values()) > 50
 
 
+def test_all_photos_are_smoothed_only_where_a_few_lost_ones_gain_by_it(
+    photos: list[np.ndarray], tmp_path: Path
+) -> None:
+    """A photo of something else has no place, however it is looked at."""
+    foreign = np.random.default_rng(0).integers(0, 256, photos[0].shape).astype(np.uint8)
+    work = Work(tmp_path, work_on([*photos, foreign], tmp_path), 1)
+    (only,) = attempts(work)
+    assert only.registered == len(photos)
+    assert (tmp_path / "tried_1.0.db").is_file()
+    assert len(list((tmp_path / "photos_1.0").iterdir())) <= 3  # it, and the two that it matches best
+    assert not (tmp_path / "smoothed_1.0.db").exists()
+
+
 def test_of_many_photos_those_that_are_alike_are_matched(tmp_path: Path) -> None:
     """Three things in turn, 90 photos: each photo shows half of one thing, and something of its own."""
-    import pycolmap
-
     rng = np.random.default_rng(0)
 
     def descriptors(count: int) -> np.ndarray:
@@ -445,11 +485,12 @@ def test_of_many_photos_those_that_are_alike_are_matched(tmp_path: Path) -> None
 
 def test_the_second_pass_takes_more() -> None:
     """A few photos of the first pass lead to a second one, whose thresholds are all lower."""
-    first, second = (Attempt.__new__(Attempt) for _ in range(2))
-    first.tolerant, second.tolerant = False, True
-    first.coarse = second.coarse = first.fixed = second.fixed = False
-    assert second._geometry().min_num_inliers < first._geometry().min_num_inliers
-    mild, strict = second._mapping(), first._mapping()
+    work = Work.__new__(Work)
+    work.fixed, work.now = False, FINE
+    strict = work.mapping()
+    work.now = PASSES[-1]
+    mild = work.mapping()
+    assert work.now.tolerant
     assert mild.min_num_matches < strict.min_num_matches
     for name in ("init_min_num_inliers", "init_min_tri_angle", "abs_pose_min_num_inliers"):
         assert getattr(mild.mapper, name) < getattr(strict.mapper, name)
@@ -476,20 +517,18 @@ def test_observations_that_lie_far_off_do_not_turn_the_cameras(
     photos: list[np.ndarray], tmp_path: Path
 ) -> None:
     """3 px is near enough to be placed with, and far in photos of this size."""
-    import pycolmap
-
     given = work_on(photos, tmp_path)
-    one = Attempt(tmp_path, given, 1, tolerant=False)
+    one = Attempt(Work(tmp_path, given, 1), FINE)
     one.run()
     assert one.model is not None
     right = rotations(one.model)
     for image in one.model.images.values():
         for point in list(image.points2D)[::10]:
             point.xy = np.add(point.xy, (3.0, 0.0))
-    pycolmap.bundle_adjustment(one.model, one._mapping().get_global_bundle_adjustment())
+    pycolmap.bundle_adjustment(one.model, one.work.mapping().get_global_bundle_adjustment())
     one.model.update_point_3d_errors()
     turned = rotation_angles(rotations(one.model) @ right.swapaxes(1, 2))
-    one._settle(one.model)
+    one.work.settle(one.model)
     settled = rotation_angles(rotations(one.model) @ right.swapaxes(1, 2))
     assert np.median(settled) < 0.3 * np.median(turned)
 

@@ -10,7 +10,7 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from hqgs.scene.sfm.facts import borne_out
-from hqgs.scene.sfm.failure import Pass, why_doubtful
+from hqgs.scene.sfm.failure import Outcome, why_doubtful
 
 
 def test_wrong_places_are_told_by_the_matches_that_they_contradict(tmp_path: Path) -> None:
@@ -30,6 +30,6 @@ def test_wrong_places_are_told_by_the_matches_that_they_contradict(tmp_path: Pat
     frame.rig_from_world = turn * pose
     wrong = borne_out(tmp_path / "colmap.db", model)
     assert 0.5 < wrong < 0.85  # those of 24 of 40 pairs are as they were
-    one = Pass(False, 10, {}, [], [], borne_out=wrong)
+    one = Outcome(False, 10, {}, [], [], borne_out=wrong)
     assert f"bear out only {wrong:.0%} of the matches" in why_doubtful(one)
     assert why_doubtful(replace(one, borne_out=right)) == why_doubtful(replace(one, borne_out=None)) == ""

@@ -13,13 +13,12 @@ from test_sfm import cards  # noqa: F401
 from test_sharpen import made  # noqa: F401
 
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.agree import agreement, confirmed, loose_parts
-from hqgs.scene.sfm.attempt import Attempt
-from hqgs.scene.sfm.facts import placed_names
-from hqgs.scene.sfm.failure import Pass, doubtful, why_doubtful
-from hqgs.scene.sfm.home import without
+from hqgs.scene.sfm.failure import Outcome, doubtful, why_doubtful
+from hqgs.scene.sfm.passes import PASSES, Attempt, Work
+from hqgs.scene.sfm.refine import placed_names, without
+from hqgs.scene.sfm.refine.agree import agreement, confirmed, loose_parts
+from hqgs.scene.sfm.refine.tracks import Tracks, read_tracks, rebuilt
 from hqgs.scene.sfm.run import Model
-from hqgs.scene.sfm.tracks import Tracks, read_tracks, rebuilt
 from hqgs.scene.sfm.triangulated import write_photos
 
 Made = tuple[pycolmap.Reconstruction, list[np.ndarray], Path]
@@ -38,7 +37,7 @@ def test_places_that_photos_bear_out_are_told_from_others(made: Made) -> None:  
     model.frames[model.images[4].frame_id].rig_from_world = pycolmap.Rigid3d(wrong)
     told = agreement(model, folder)
     assert [name for name, counts in told.items() if not confirmed(*counts)] == ["3.png"]
-    one = Pass(False, 8, {}, [], [], agree={name: list(counts) for name, counts in told.items()})
+    one = Outcome(False, 8, {}, [], [], agree={name: list(counts) for name, counts in told.items()})
     assert doubtful(one) == ["3.png"]
     looked, agreed, beside = told["3.png"]
     said = f"The places of 1 photos are in doubt (tree.jpg): of {looked} points that one should show it shows"
@@ -49,7 +48,9 @@ def test_places_that_photos_bear_out_are_told_from_others(made: Made) -> None:  
 
 def test_a_part_that_lies_wrong_as_a_whole_is_told(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     """Its photos bear each other out, and 12 points join it to the rest: two sides of a house look alike."""
-    monkeypatch.setattr("hqgs.scene.sfm.agree.WEAKLY_JOINT", 20)  # photos share fewer here than real ones
+    monkeypatch.setattr(
+        "hqgs.scene.sfm.refine.agree.WEAKLY_JOINT", 20
+    )  # photos share fewer here than real ones
     model, true, folder = made
     names, tracks = read_tracks(model)
     part = (tracks.view >= 5).astype(np.intp)
@@ -82,7 +83,7 @@ def attempt(cards: Scene, tmp_path: Path) -> Attempt:  # noqa: F811
         "Ks": np.stack([camera.K for camera in cameras]),
         "photos": np.array(str(tmp_path / "photos")),
     }
-    ran = Attempt(tmp_path, given, 1)
+    ran = Attempt(Work(tmp_path, given, 1), PASSES[1])
     ran.run()
     assert ran.registered == 7
     return ran
@@ -113,7 +114,7 @@ def test_lost_photos_come_home_and_strange_ones_do_not(attempt: Attempt) -> None
     spin = Rotation.from_euler("x", 25, degrees=True).as_matrix()
     frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(spin), np.zeros(3)) * frame.rig_from_world
     home.update_point_3d_errors()
-    attempt.sharpen()
+    attempt.refine()
     assert attempt.model is not None
     assert placed_names(attempt.model) == set(before) - {"00002.png"}
     assert set(attempt.agree) == set(before) - {"00002.png"}
@@ -137,7 +138,7 @@ def test_parts_that_hang_on_few_points_are_told(made: Made) -> None:  # noqa: F8
     hung = rebuilt(model, [f"{k}.png" for k in range(8)], tracks)
     parts = loose_parts(hung)
     assert parts == [(["4.png", "5.png", "6.png"], 12), (["7.png"], 9)]
-    said = why_doubtful(Pass(False, 8, {}, [], [], loose=parts))
+    said = why_doubtful(Outcome(False, 8, {}, [], [], loose=parts))
     assert "4.png, 5.png, 6.png by 12 points; 7.png by 9 points. Take photos between these" in said
     more = replace(tracks, view=np.append(tracks.view, [2] * 8), point=np.append(tracks.point, range(60, 68)))
     more = replace(more, xy=rng.random((len(more.view), 2)))
@@ -154,7 +155,9 @@ def test_a_run_says_that_no_pose_can_be_trusted() -> None:
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     features = {f"{k}.png": 500 for k in range(4)}
     good, bad = [40, 30, 5], [40, 6, 5]
-    one = Pass(False, 4, features, [], [], agree={"0.png": bad, "1.png": bad, "2.png": good, "3.png": good})
+    one = Outcome(
+        False, 4, features, [], [], agree={"0.png": bad, "1.png": bad, "2.png": good, "3.png": good}
+    )
     assert len(Model(model, [one]).poses()) == 4
     worse = replace(one, agree=one.agree | {"2.png": bad})
     with pytest.raises(ValueError, match=r"no pose of these photos can be trusted\. The places of 3 photos"):

@@ -12,11 +12,11 @@ from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from hqgs.scene.sfm import patches
-from hqgs.scene.sfm.sharpen import sharpened
-from hqgs.scene.sfm.tracks import Tracks, errors, read_tracks, rebuilt, sureness, usual
-from hqgs.scene.sfm.versions import join, smoothed_copies
-from hqgs.scene.sfm.weighted import weighted
+from hqgs.scene.sfm.database import join
+from hqgs.scene.sfm.passes import smooth_copy
+from hqgs.scene.sfm.refine import patches, sharpened
+from hqgs.scene.sfm.refine.tracks import Tracks, errors, read_tracks, rebuilt, sureness, usual
+from hqgs.scene.sfm.refine.weighted import weighted
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 160, 120, 150.0, 4.0
 NOISE = 12.0  # levels
@@ -234,11 +234,11 @@ def test_smoothed_copies_are_those_of_what_sift_sees(tmp_path: Path) -> None:
     photo[20, 30] = 255
     Image.fromarray(photo).save(tmp_path / "photos" / "a" / "dot.png")
     for largest, sigma in ((100, 1.0), (30, 61 / 30)):
-        out = tmp_path / f"out{largest}"
-        smoothed_copies(tmp_path / "photos", out, ["a/dot.png"], 1.0, largest)
-        with Image.open(out / "a" / "dot.png") as image:
+        copy = tmp_path / f"out{largest}" / "a" / "dot.png"
+        smooth_copy(tmp_path / "photos" / "a" / "dot.png", copy, 1.0, largest)
+        with Image.open(copy) as image:
             assert image.getpixel((30, 20)) == pytest.approx(255 / (2 * np.pi * sigma**2), rel=0.05)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["out100", "out30", "photos"]
+        assert [p.name for p in copy.parent.iterdir()] == ["dot.png"]
 
 
 def test_observations_count_by_their_precision_in_each_direction() -> None:

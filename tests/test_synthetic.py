@@ -19,7 +19,7 @@ from hqgs.scene.builtin.studio import studio
 from hqgs.scene.known_points import with_points
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.sfm import triangulated
-from hqgs.scene.sfm.constants import PARTNERS
+from hqgs.scene.sfm.likely import PARTNERS
 from hqgs.scene.sfm.triangulated import SparsePoints, pairs_of
 
 Points3 = NDArray[np.float64]

@@ -26,7 +26,7 @@ from hqgs.photos.look import as_a_lens, as_responses
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Scene, View
-from hqgs.scene.sfm.constants import JOINT
+from hqgs.scene.sfm.refine.agree import JOINT
 
 Floats = NDArray[np.float64]
 # of white in linear light: beyond them noise and the sensor's white tell nothing

@@ -14,7 +14,8 @@ from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.constants import AXES_CLEAR, AXES_FEWEST, AXES_PAIRS, COPY_SIDE
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import View
-from hqgs.scene.sfm.constants import EPIPOLAR, LOWE_RATIO
+from hqgs.scene.sfm.facts import EPIPOLAR
+from hqgs.scene.sfm.likely import LOWE_RATIO
 
 Floats = NDArray[np.float64]
 TURNED = np.diag([1.0, -1.0, -1.0, 1.0])  # y down and z forward for y up and z back, and the other way round

@@ -1,5 +1,5 @@
-"""The numbers of scenes, each with its meaning and unit. Those of finding cameras are in
-sfm/constants.py; what a built-in room is like is told beside it.
+"""The numbers of scenes, each with its meaning and unit. Those of finding cameras stand
+beside their use; what a built-in room is like is told beside it.
 
 Limits keep damaged files and short memory out; what decides between good inputs was tried on the captures of
 the tests and on fern, fox and horns; those of GPS, of tags and of where to photograph next were set by hand.

@@ -12,9 +12,10 @@ from hqgs.base.files import atomic_path
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.random_points import NO_POINTS
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.constants import TOO_SMALL
 from hqgs.scene.sfm.run import key_of
 from hqgs.scene.sfm.triangulated import SparsePoints, triangulated
+
+TOO_SMALL = 100  # px of the photos, below which COLMAP finds no points
 
 
 def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent) -> Scene:

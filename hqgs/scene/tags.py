@@ -30,8 +30,9 @@ from hqgs.scene.constants import (
 from hqgs.scene.metres import with_metres
 from hqgs.scene.paths import scene_up
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.scene.sfm.constants import PATCH_SIDE
 from hqgs.scene.similarity import similarity
+
+PATCH_SIDE = 1000  # px, least, of the photos in which tags are looked for
 
 FAMILIES = ("APRILTAG_36h11", "ARUCO_ORIGINAL", "4X4_250", "5X5_250", "6X6_250")  # in this order
 

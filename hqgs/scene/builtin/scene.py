@@ -20,8 +20,7 @@ from hqgs.scene.builtin.shading import render_depth, render_view
 from hqgs.scene.constants import PATH_SIZE, TEST_EVERY
 from hqgs.scene.geometry import unproject
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.scene.sfm.constants import TRIANGULATION
-from hqgs.scene.sfm.triangulated import SparsePoints, in_order, triangulated
+from hqgs.scene.sfm.triangulated import TRIANGULATION, SparsePoints, in_order, triangulated
 
 FORMAT = 2  # raised by hand where other photos or points are made, or kept otherwise
 WIDTH, HEIGHT = PATH_SIZE

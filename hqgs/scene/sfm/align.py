@@ -11,9 +11,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hqgs.scene.constants import ROUNDING
-from hqgs.scene.sfm.constants import FARTHEST, HUBER
-from hqgs.scene.sfm.tracks import Tracks
+from hqgs.scene.sfm.refine.tracks import Tracks
 from hqgs.scene.similarity import Rows, robust, similarity
+
+HUBER, FARTHEST = 1.0, 1e3  # px from where on a distance counts linearly, and no more
 
 Floats = NDArray[np.float64]
 

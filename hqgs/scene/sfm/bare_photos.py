@@ -13,18 +13,19 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from hqgs._rust import get_num_threads
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import as_text, some
 from hqgs.photos import profiles
 from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import PHOTO_SUFFIXES, Glance, UnreadableError, decode, glance, needs_heic
 from hqgs.scene.capture import photo_folder
-from hqgs.scene.constants import JPEG_QUALITY, MAX_WORKERS
+from hqgs.scene.constants import JPEG_QUALITY, MAX_WORKERS, MOST_SIDE
 from hqgs.scene.faces import CUBE, face_name
 from hqgs.scene.film import frames_around
 from hqgs.scene.names import FRAMES, KEPT
 from hqgs.scene.photo_files import is_mask_folder, is_run, masks_among
-from hqgs.scene.sfm.constants import FOLDERS_DEEP
+from hqgs.scene.sfm.database import seen_size
 from hqgs.scene.sfm.front_door import (
     cameras_beside,
     copies,
@@ -36,8 +37,10 @@ from hqgs.scene.sfm.front_door import (
     strays,
     understood,
 )
-from hqgs.scene.sfm.panoramas import all_around, colmap_faces, write_faces
+from hqgs.scene.sfm.panoramas import all_around, colmap_faces, faces_seen
 from hqgs.scene.sfm.run import Guess
+
+FOLDERS_DEEP = 5  # below the one named in which photos are looked for: Takeout/Google Photos/Walk
 
 COLMAP_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP")  # what files of those suffixes hold
 FOR_COLMAP = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # other photos are converted for it
@@ -88,48 +91,76 @@ class BarePhotos:
         faces = len(CUBE) if self.around else 1
         return (b"" if k else (self.folder / name).read_bytes() for name in self.names for k in range(faces))
 
-    def guess(self) -> Guess:
-        """Photos of one size by the same make, model and zoom share a camera; EXIF gives its focal length.
+    def guess(self, largest: int = MOST_SIDE) -> Guess:
+        """Cameras of the photos, where no side has more than `largest` px.
 
+        Photos of one size by the same make, model and zoom share a camera; EXIF gives its focal length.
         Panoramas of one size share the cameras of their faces, all of which are known.
         """
         if self.around:
             sizes = list(dict.fromkeys(self.sizes))
             front = [colmap_faces(*size)[0] for size in sizes]
             of_photo = [sizes.index(size) for size in self.sizes for _ in CUBE]
+            seen = [seen_size((face.width, face.height), largest) for face in front]
             return Guess(
-                [(face.width, face.height) for face in front],
-                [float(face.K[0, 0]) for face in front],
+                seen,
+                [
+                    float(face.K[0, 0]) * side / face.width
+                    for face, (side, _) in zip(front, seen, strict=True)
+                ],
                 of_photo,
                 rotations=np.stack([*CUBE.values()]),
             )
         keys = [(*size, *exif.camera) for size, exif in zip(self.sizes, self.exif, strict=True)]
         cameras = list(dict.fromkeys(keys))
         first = [keys.index(camera) for camera in cameras]
+        seen = [seen_size(self.sizes[k], largest) for k in first]
         return Guess(
-            [self.sizes[k] for k in first],
-            [self.exif[k].focal for k in first],
+            seen,
+            [
+                self.exif[k].focal * max(size) / max(self.sizes[k])
+                for k, size in zip(first, seen, strict=True)
+            ],
             [cameras.index(k) for k in keys],
             (self.folder / FRAMES).is_file(),
         )
 
-    def write(self, folder: Path) -> None:
-        """The photos under COLMAP's names into a folder, as links where COLMAP can read them."""
-        if self.around:
-            targets = [folder / target for target in self.colmap_names]
-            for k, name in enumerate(self.names):
-                write_faces(self.folder / name, targets[k * len(CUBE) : (k + 1) * len(CUBE)], JPEG_QUALITY)
-            return
+    def write(self, folder: Path, largest: int = MOST_SIDE) -> None:
+        """The photos under COLMAP's names into a folder, no side longer than `largest` px; as links where
+        COLMAP can read them as they are."""
+        targets: dict[str, list[Path]] = {}
         for target, name in self.colmap_names.items():
-            path = folder / target
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if not self.as_it_is(name):
-                Image.fromarray(decode(self.folder / name)[0]).save(path, quality=JPEG_QUALITY, subsampling=0)
-                continue
-            try:
-                path.symlink_to(self.folder / name)
-            except OSError:  # the file system has no links
-                shutil.copyfile(self.folder / name, path)
+            targets.setdefault(name, []).append(folder / target)
+            targets[name][-1].parent.mkdir(parents=True, exist_ok=True)
+        sizes = dict(zip(self.names, self.sizes, strict=False))  # none, where nothing was looked into
+
+        def write(name: str) -> None:
+            source, size = self.folder / name, sizes.get(name, (0, 0))
+            if self.around:
+                pictures = faces_seen(source, largest)
+            elif self.as_it_is(name) and max(size) <= largest:
+                return link(source, targets[name][0])
+            else:
+                pictures = [small_copy(source, seen_size(size, largest))]
+            for picture, target in zip(pictures, targets[name], strict=True):
+                picture.save(target, quality=JPEG_QUALITY, subsampling=0)
+
+        with ThreadPoolExecutor(min(MAX_WORKERS, get_num_threads())) as pool:
+            list(pool.map(write, self.names))
+
+
+def small_copy(path: Path, size: tuple[int, int]) -> Image.Image:
+    """A photo at a smaller size [2], of which no more is decoded than that needs; (0, 0): as it is."""
+    picture = Image.fromarray(decode(path, size if any(size) else None)[0])
+    return picture.resize(size, Image.Resampling.BOX) if any(size) and picture.size != size else picture
+
+
+def link(source: Path, target: Path) -> None:
+    """A link to a file, or a copy where the file system has no links."""
+    try:
+        target.symlink_to(source)
+    except OSError:
+        shutil.copyfile(source, target)
 
 
 def bare_photos(root: Path, downscale: float) -> BarePhotos | None:

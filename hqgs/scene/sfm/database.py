@@ -1,17 +1,34 @@
-"""COLMAP's database before anything is found: photos, and their cameras.
+"""COLMAP's database: photos and their cameras, features and matches before their geometry is checked.
 
 It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
-from hqgs.scene.sfm.constants import FOCAL
+LEAST_PHOTOS = 3  # of a scene or model: one alone shows no depth
+PROBED = 8  # photos that tell of all what files do not: how rich they are, whether they are panoramas
+LARGEST = 1600  # px a side: features of larger photos cost minutes and place no camera better than that
+FOCAL = pycolmap.ImageReaderOptions().default_focal_length_factor  # in longer sides, where nothing tells
+
+
+BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
+
+
+def seen_size(size: tuple[int, int], largest: int) -> tuple[int, int]:
+    """A size [2], px, no side longer than about `largest`: the one near it that distorts least."""
+    if max(size) <= largest:
+        return size
+    small = [tuple(side * share / max(size) for side in size) for share in range(largest - 15, largest + 1)]
+    width, height = min(reversed(small), key=lambda sides: sum(abs(side - round(side)) for side in sides))
+    return max(1, round(width)), max(1, round(height))
 
 
 def known_cameras(given: dict[str, Any], database: Path) -> pycolmap.Reconstruction:
@@ -99,3 +116,75 @@ def _camera(
     width, height = size
     params = [focal, width / 2, height / 2, *distortion]
     return pycolmap.Camera(camera_id=number, model=model, width=width, height=height, params=params)
+
+
+def extract(directory: Path, photos: Path, names: list[str], extraction: Any, database: Path) -> None:
+    """Features of photos that have none yet."""
+    reader = pycolmap.ImageReaderOptions()
+    if (directory / "masks").is_dir():
+        reader.mask_path = directory / "masks"
+    found = {"reader_options": reader, "extraction_options": extraction, "device": pycolmap.Device.cpu}
+    pycolmap.extract_features(database, photos, image_names=names, **found)
+
+
+def match(directory: Path, names: list[str], pairs: Any, threads: int, database: Path) -> None:
+    """Matches of the pairs [P, 2] that have none yet, None: of all; geometry is not checked."""
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads, matching.skip_geometric_verification = threads, True
+    if pairs is None:
+        every = pycolmap.ExhaustivePairingOptions()
+        every.block_size = max(2, -(-len(names) // BLOCKS))
+        pycolmap.match_exhaustive(
+            database, matching_options=matching, pairing_options=every, device=pycolmap.Device.cpu
+        )
+        return
+    listed = pycolmap.ImportedPairingOptions()
+    listed.match_list_path, listed.block_size = directory / "pairs.txt", -(-len(pairs) // BLOCKS**2)
+    text = "".join(f"{names[i]} {names[j]}\n" for i, j in pairs.tolist())
+    listed.match_list_path.write_text(text, encoding="utf-8")
+    pycolmap.match_image_pairs(
+        database, matching_options=matching, pairing_options=listed, device=pycolmap.Device.cpu
+    )
+
+
+def table(database: Path, photos: int, read: str) -> NDArray[np.int64]:
+    """Counts [V, V] of each pair of photos, by the method `read` of the database."""
+    found = np.zeros((photos, photos), np.int64)
+    with pycolmap.Database.open(database) as db:
+        for pair, count in zip(*getattr(db, read)(), strict=True):
+            a, b = (number - 1 for number in pycolmap.pair_id_to_image_pair(pair))
+            found[a, b] = found[b, a] = count
+    return found
+
+
+def join(versions: Sequence[Path], into: Path, photos: int) -> None:
+    """Write the features and matches of versions of photos, a database each, into one that has the photos.
+
+    Features of the first version come first. Each version was matched by itself: a feature that two versions
+    show would pass for ambiguous.
+    """
+    keypoints = [[np.zeros((0, 6), np.float32)] * photos for _ in versions]
+    matches: dict[tuple[int, int], list[np.ndarray]] = {}
+    before = np.zeros(photos, np.int64)  # features of earlier versions
+    for found, version in zip(keypoints, versions, strict=True):
+        with pycolmap.Database.open(version) as db:
+            for k in range(photos):
+                if db.exists_keypoints(k + 1):
+                    found[k] = np.asarray(db.read_keypoints(k + 1), np.float32)
+            for pair, rows in zip(*db.read_all_matches(), strict=True):
+                first, second = pycolmap.pair_id_to_image_pair(pair)
+                moved = np.asarray(rows, np.int64) + before[[first - 1, second - 1]]
+                matches.setdefault((first, second), []).append(moved)
+        before = before + [len(one) for one in found]
+    with pycolmap.Database.open(into) as db:
+        for k in range(photos):
+            db.write_keypoints(k + 1, np.concatenate([found[k] for found in keypoints]))
+        for (first, second), rows in sorted(matches.items()):
+            db.write_matches(first, second, np.concatenate(rows).astype(np.uint32))
+
+
+def pipeline_options() -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
+    return options

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from hqgs.scene.sfm.constants import EPIPOLAR
+EPIPOLAR = pycolmap.TwoViewGeometryOptions().ransac.max_error  # px from its epipolar line that a match may be
 
 
 def counts(database: Path, placed: set[str]) -> dict[str, Any]:
@@ -66,11 +66,6 @@ def borne_out(database: Path, model: pycolmap.Reconstruction) -> float:
         agree += int((off <= EPIPOLAR * np.linalg.norm(slopes, axis=1)).sum())
         total += len(matches)
     return agree / max(total, 1)
-
-
-def placed_names(model: pycolmap.Reconstruction) -> set[str]:
-    """The photos that have a place in a model."""
-    return {model.images[k].name for k in model.reg_image_ids()}
 
 
 def apart(models: list[set[str]], least: int) -> list[list[str]]:

@@ -6,14 +6,20 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import pycolmap
 
 from hqgs.base.text import some
-from hqgs.scene.sfm.agree import confirmed
-from hqgs.scene.sfm.constants import BORNE_OUT, ENOUGH_INLIERS, FEW_FEATURES, JOINT, MATCHES, POOR
+from hqgs.scene.sfm.refine.agree import JOINT, confirmed
+
+MATCHES = pycolmap.TwoViewGeometryOptions().min_num_inliers  # that agree, of a pair; COLMAP's own
+FEW_FEATURES = 150  # a photo with fewer is blurred, or shows nothing that can be found again
+POOR = 0.25  # of the features of the others: the same
+ENOUGH_INLIERS = 30  # a pair with so many matches that one geometry bears out shows the same thing
+BORNE_OUT = 0.85  # of matches between panoramas: 0.91 and 0.93 at right places, 0.68 and 0.79 at wrong ones
 
 
 @dataclass(frozen=True)
-class Pass:
+class Outcome:
     """What one pass of COLMAP came to."""
 
     tolerant: bool
@@ -31,7 +37,7 @@ class Pass:
     borne_out: float | None = None  # share of the inliers that the places of panoramas bear out
 
 
-def why_no_model(photos: int, passes: Sequence[Pass]) -> str:
+def why_no_model(photos: int, passes: Sequence[Outcome]) -> str:
     """Why no model could be started, with counts, and what to do; a sentence or two for the user."""
     found = counts(photos, passes)
     last = passes[-1]
@@ -54,7 +60,7 @@ def why_no_model(photos: int, passes: Sequence[Pass]) -> str:
     )
 
 
-def why_few(photos: int, passes: Sequence[Pass]) -> str:
+def why_few(photos: int, passes: Sequence[Outcome]) -> str:
     """What to do where some photos have no place; one sentence with counts."""
     first = passes[0]
     poor = sorted(name for name, count in first.features.items() if count < FEW_FEATURES)
@@ -67,7 +73,7 @@ def why_few(photos: int, passes: Sequence[Pass]) -> str:
     return f"{counts(photos, passes)}; {advice}"
 
 
-def why_lost(name: str, one: Pass, placed: Container[str] = ()) -> str:
+def why_lost(name: str, one: Outcome, placed: Container[str] = ()) -> str:
     """Why a pass found no place for a photo, in words with numbers; `placed`: those that have one by now."""
     features, usual = one.features[name], float(np.median(list(one.features.values())))
     matches, inliers, with_placed = one.best[name]
@@ -109,7 +115,7 @@ def what_to_take(lost: Mapping[str, str], names: Sequence[str], apart: Sequence[
     return "; ".join(said)
 
 
-def doubtful(one: Pass) -> list[str]:
+def doubtful(one: Outcome) -> list[str]:
     """Photos whose places are no better than chance: they do not show what they should."""
     return sorted(
         name
@@ -118,7 +124,7 @@ def doubtful(one: Pass) -> list[str]:
     )
 
 
-def why_doubtful(one: Pass, called: Callable[[str], str] = str) -> str:
+def why_doubtful(one: Outcome, called: Callable[[str], str] = str) -> str:
     """That places may be wrong, and what to do; empty where nothing says so."""
     if one.loose and not doubtful(one):
         parts = [f"{some([called(name) for name in part])} by {points} points" for part, points in one.loose]
@@ -142,7 +148,7 @@ def why_doubtful(one: Pass, called: Callable[[str], str] = str) -> str:
     )
 
 
-def counts(photos: int, passes: Sequence[Pass]) -> str:
+def counts(photos: int, passes: Sequence[Outcome]) -> str:
     """What was found, in numbers."""
     first, pairs = passes[0], photos * (photos - 1) // 2
     features = list(first.features.values()) or [0]
@@ -155,9 +161,9 @@ def counts(photos: int, passes: Sequence[Pass]) -> str:
     return found
 
 
-def _is_poor(one: Pass) -> bool:
+def _is_poor(one: Outcome) -> bool:
     return float(np.median(list(one.features.values()) or [0])) < FEW_FEATURES
 
 
-def _pairs(one: Pass) -> int:
+def _pairs(one: Outcome) -> int:
     return sum(count >= ENOUGH_INLIERS for count in one.inliers)

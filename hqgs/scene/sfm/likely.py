@@ -13,14 +13,20 @@ from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
 from hqgs.base.machine import AT_ONCE
-from hqgs.scene.sfm.constants import COMPARED, DESCRIPTOR, FILM_NEAR, FILM_THIN, LOWE_RATIO, NEXT, PARTNERS
+
+LOWE_RATIO = pycolmap.FeatureMatchingOptions().sift.max_ratio  # of descriptors' distances (Lowe 2004)
+MATCHED_ALL = 60  # photos; of fewer each is matched with each
+COMPARED = 256  # features of a photo, the largest, that tell its partners
+PARTNERS, NEXT = 20, 4  # of a photo: those that are most like it, and those that follow it
+FILM_NEAR, FILM_THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
+DESCRIPTOR = 512  # length of COLMAP's descriptors, whole numbers
 
 
-def likely_pairs(db: pycolmap.Database, count: int) -> NDArray[np.int64]:
+def likely_pairs(db: pycolmap.Database, count: int, most: int = PARTNERS) -> NDArray[np.int64]:
     """Pairs [P, 2] of `count` photos, which have the numbers 1 to `count` in `db`, sorted, from 0.
 
-    The largest features of each photo are compared with those of each other. A photo is paired with the 20
-    that most of its features fit, and the 4 next ones in the order of names: people walk on between photos.
+    The largest features of each photo are compared with those of each other. A photo is paired with the
+    `most` that most of its features fit, and the 4 next ones by name: people walk on between photos.
     The numbers are whole and below 2^24, so that no order of sums and no number of threads changes a pair.
     """
     descriptors = [_largest(db, k + 1) for k in range(count)]
@@ -33,7 +39,7 @@ def likely_pairs(db: pycolmap.Database, count: int) -> NDArray[np.int64]:
         for k, one in enumerate(descriptors):
             for other, alike in enumerate(np.split(one @ together, ends[:-1], axis=1), start):
                 scores[k, other] = 0 if k == other else fitting(alike, DESCRIPTOR)
-    return partners(scores + scores.T, PARTNERS)
+    return partners(scores + scores.T, most)
 
 
 def partners(scores: NDArray[np.int64], most: int) -> NDArray[np.int64]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +14,13 @@ from hqgs.base.text import some
 from hqgs.photos.exif import Exif
 from hqgs.photos.files import Glance, UnreadableError, decode
 from hqgs.scene.faces import Face, around, faces_of
-from hqgs.scene.sfm.constants import FINER, LEAST_PHOTOS, PANORAMA_PLAIN, PANORAMA_POLE, PANORAMA_SEAM, PROBED
+from hqgs.scene.sfm.database import LEAST_PHOTOS, PROBED, seen_size
 from hqgs.scene.views import to_pinhole
+
+SEAM = 2.0  # times what neighbouring columns differ by: the last and the first of it are neighbours
+POLE = 0.35  # of the picture's contrast: its first and last rows show a point each
+PLAIN = 0.25  # the same: a border with less shows nothing
+FINER = 4 / math.pi  # times a face's pixels: in its middle as fine as the photo, so that SIFT sees all of it
 
 
 def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> tuple[bool, list[str]]:
@@ -63,8 +70,8 @@ def _closes(path: Path) -> bool:
     apart = np.abs(np.diff(pixels, axis=1)).mean((0, 2))
     seam = np.abs(pixels[:, 0] - pixels[:, -1]).mean()
     poles, border = pixels[[0, -1]].std(1).mean(1), pixels[:, 0].std(0).mean()
-    joined, poles_plain = seam <= PANORAMA_SEAM * np.median(apart), (poles <= PANORAMA_POLE * contrast).all()
-    return bool(joined and poles_plain and border > PANORAMA_PLAIN * contrast)
+    joined, poles_plain = seam <= SEAM * np.median(apart), (poles <= POLE * contrast).all()
+    return bool(joined and poles_plain and border > PLAIN * contrast)
 
 
 def colmap_faces(width: int, height: int) -> tuple[Face, ...]:
@@ -72,12 +79,12 @@ def colmap_faces(width: int, height: int) -> tuple[Face, ...]:
     return faces_of(around(width, height), FINER)
 
 
-def write_faces(path: Path, targets: list[Path], quality: int) -> None:
-    """The faces of a panorama as JPEG files, in the order of `colmap_faces`."""
+def faces_seen(path: Path, largest: int) -> Iterator[Image.Image]:
+    """The faces of a panorama, in the order of `colmap_faces`, no side longer than about `largest` px."""
     pixels, _ = decode(path)
     height, width = pixels.shape[:2]
     camera = around(width, height)
-    for face, target in zip(colmap_faces(width, height), targets, strict=True):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        view = to_pinhole(camera, width, height, face=face)
-        Image.fromarray(view.picture(pixels)).save(target, quality=quality, subsampling=0)
+    for face in colmap_faces(width, height):
+        picture = Image.fromarray(to_pinhole(camera, width, height, face=face).picture(pixels))
+        size = seen_size(picture.size, largest)
+        yield picture if size == picture.size else picture.resize(size, Image.Resampling.BOX)

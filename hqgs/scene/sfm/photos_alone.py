@@ -15,17 +15,19 @@ from hqgs.base.text import as_text
 from hqgs.photos.exif import Exif
 from hqgs.photos.files import is_shown
 from hqgs.scene.capture import Capture, Photo, keep_finite
-from hqgs.scene.faces import around
+from hqgs.scene.faces import CUBE, around
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import model_points, registered, seen_points
 from hqgs.scene.masks import masks_of
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
-from hqgs.scene.sfm.constants import LEAST_AGREED
+from hqgs.scene.sfm.database import LARGEST
 from hqgs.scene.sfm.front_door import tell_strays
+from hqgs.scene.sfm.refine.tracks import sureness
 from hqgs.scene.sfm.run import run_colmap
-from hqgs.scene.sfm.tracks import sureness
+
+LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on none
 
 
 @dataclass(frozen=True)
@@ -52,12 +54,18 @@ def find_cameras(root: Path, photos: BarePhotos, search: Search) -> FoundCameras
     files = {name: file for file, name in reversed(names.items())}  # of a panorama its first face
     try:
         ran = run_colmap(
-            list(names), photos.contents(), photos.guess(), photos.write, called=names, **vars(search)
+            list(names),
+            photos.contents(),
+            photos.guess(LARGEST),
+            lambda folder: photos.write(folder, LARGEST),
+            called=names,
+            **vars(search),
         )
         poses = {names[file]: viewmat for file, viewmat in ran.poses().items() if file in files.values()}
     except ValueError as error:
         raise ValueError(f"{root}: {error}") from error
     model = ran.found
+    as_stored(model, photos.guess().sizes, len(CUBE) if photos.around else 1)
     tags = dict(zip(photos.names, photos.exif, strict=True))
     upright = _upright(np.stack(list(poses.values())), [tags[name] for name in poses])
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(upright), np.zeros(3)))
@@ -125,6 +133,22 @@ def read_photos(root: Path, photos: BarePhotos, search: Search) -> Capture:
         seen=seen,
         sfm=cameras.report,
     )
+
+
+def as_stored(model: pycolmap.Reconstruction, sizes: list[tuple[int, int]], faces: int) -> None:
+    """The cameras and observations of a model at the photos' stored sizes, px: of each camera, or of so many
+    for the faces of a photo."""
+    wanted = {number: sizes[(number - 1) // faces] for number in model.cameras}
+    if all((camera.width, camera.height) == wanted[number] for number, camera in model.cameras.items()):
+        return
+    for image in model.images.values():
+        camera, size = model.cameras[image.camera_id], wanted[image.camera_id]
+        if (camera.width, camera.height) != size:
+            for point in image.points2D:
+                point.xy = point.xy * size / (camera.width, camera.height)
+    for number, camera in model.cameras.items():
+        camera.rescale(*wanted[number])
+    model.update_point_3d_errors()
 
 
 def _together(sure: dict[str, float], names: dict[str, str]) -> dict[str, float]:

@@ -13,12 +13,10 @@ and of each observation the numbers of the photo and of the point: photos [O], r
 model. Known cameras stay as they are. Of unknown ones, which are SIMPLE_RADIAL, `input.npz` has sizes [C, 2],
 focal lengths in px, focals [C], 0 where nothing is known, and the number of each photo's camera, camera_of
 [V]; where photos are faces of panoramas, the known focal lengths, and the rotations [F, 3, 3] of the F faces
-that each panorama has in `names`, one after the other. The first pass matches the pairs [P, 2], numbers of
-photos, where it has some; else all, or of many photos those that are alike. Where it has `coarse`, photos
-rich in detail are looked at coarsely, and again finely where too few find a place. Where too few do then,
-smoothed versions of the photos are looked at, first one and then all together. Where few photos have a place
-yet, another, more tolerant pass follows, with every pair; the better of the two counts. Photos without a
-place are placed by weaker evidence where others bear that out.
+that each panorama has in `names`, one after the other. The first passes match the pairs [P, 2], numbers
+of photos, where it has some; else all, or of many photos those that are alike. Where it has `coarse`, photos
+rich in detail are looked at coarsely first. The passes are those of `passes.py`, in their order, as long as
+too few photos have a place; the best one counts.
 In the end observations are moved to where the photos agree. `facts.json` says what all came to,
 `stage.json` what is being done now, which is read from COLMAP's log: the caller sends the output to
 `log.txt`. A second call in the same DIRECTORY goes on with the features and matches that the first one left.
@@ -37,10 +35,10 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from hqgs.scene.sfm.attempt import Attempt
-from hqgs.scene.sfm.constants import ALMOST, COARSE, ENOUGH_PLACED, LARGEST, MAX_ERROR, MIN_TRACK
-from hqgs.scene.sfm.database import known_cameras
-from hqgs.scene.sfm.matching import match, pipeline_options
+from hqgs.scene.sfm.database import LARGEST, extract, known_cameras, match, pipeline_options
+from hqgs.scene.sfm.passes import COARSE, Work, attempts
+
+MIN_TRACK, MAX_ERROR = 3, 1.0  # a point needs so many photos, and may miss them by so many px on average
 
 
 def triangulate(directory: Path) -> None:
@@ -54,7 +52,8 @@ def triangulate(directory: Path) -> None:
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads, extraction.max_image_size = 1, LARGEST
     extraction.sift.max_num_features = COARSE
-    match(directory, photos, names, extraction, 1, database, wanted=lambda: given.get("pairs"))
+    extract(directory, photos, names, extraction, database)
+    match(directory, names, given.get("pairs"), 1, database)
     pycolmap.guided_geometric_verification(known, database, num_threads=1)
     (directory / "model").mkdir()
     options = pipeline_options()
@@ -78,40 +77,15 @@ def reconstruct(directory: Path, threads: int) -> None:
     What is found of one photo or pair depends on no other, not even its random numbers, and is read back in
     the order of numbers. Mapping has one thread and the seed 0.
     """
-    given = _given(directory)
-    passes = _by_sift(directory, given, threads)
-    best = max(passes, key=lambda one: (one.registered, -one.tolerant))
-    best.sharpen()
+    passes = attempts(Work(directory, _given(directory), threads))
+    best = max(passes, key=lambda one: one.registered)
+    best.refine()
     facts = json.dumps({"passes": [one.facts() for one in passes], "chosen": passes.index(best)})
     (directory / "facts.json").write_text(facts, encoding="utf-8")
     if best.model is not None:
         (directory / "model").mkdir(exist_ok=True)
         best.model.write_binary(directory / "model")
         (directory / "model" / "facts.json").write_text(facts, encoding="utf-8")
-
-
-def _by_sift(directory: Path, given: dict[str, Any], threads: int) -> list[Attempt]:
-    """The best of the passes, and a tolerant one where it was made."""
-    passes = [Attempt(directory, given, threads, coarse="coarse" in given)]
-    passes[0].run()
-    plain = passes[0].database
-    if passes[0].coarse and passes[0].registered < ALMOST * len(given["names"]):
-        fine = Attempt(directory, given, threads)
-        fine.run()
-        plain = fine.database
-        passes = [max(fine, passes[0], key=lambda one: one.registered)]
-    for smoothed in (1, 2):
-        if passes[0].registered >= ALMOST * len(given["names"]):
-            break
-        again = Attempt(directory, given, threads, smoothed=smoothed, plain=plain)
-        again.run()
-        passes = [max(passes[0], again, key=lambda one: one.registered)]
-    passes[0].bring_home()
-    if passes[0].registered < ENOUGH_PLACED * len(given["names"]):
-        passes.append(Attempt(directory, given, threads, tolerant=True))
-        passes[1].run()
-        passes[1].bring_home()
-    return passes
 
 
 def _given(directory: Path) -> dict[str, Any]:

@@ -14,8 +14,8 @@ from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.formats.colmap import seen_points
 from hqgs.scene.scene import Scene, SfmReport, TrackStatistics, View
 from hqgs.scene.sfm.align import align, camera_centers, pose_auc, refine, rotation_angles
+from hqgs.scene.sfm.refine.tracks import read_tracks, sureness
 from hqgs.scene.sfm.run import run_colmap
-from hqgs.scene.sfm.tracks import read_tracks, sureness
 from hqgs.scene.sfm.triangulated import write_photos
 
 

@@ -25,19 +25,9 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
 from hqgs.scene.sfm import likely
-from hqgs.scene.sfm.constants import (
-    AGAIN,
-    LARGEST,
-    LEAST_PHOTOS,
-    LEAST_SHARE,
-    LISTEN,
-    LONG,
-    MANY,
-    MATCHED_ALL,
-    PARTNERS,
-)
+from hqgs.scene.sfm.database import LARGEST, LEAST_PHOTOS
 from hqgs.scene.sfm.failure import (
-    Pass,
+    Outcome,
     counts,
     doubtful,
     what_to_take,
@@ -46,9 +36,19 @@ from hqgs.scene.sfm.failure import (
     why_lost,
     why_no_model,
 )
+from hqgs.scene.sfm.likely import MATCHED_ALL, PARTNERS
+
+AGAIN_SAID = {
+    "smoothed": ", with smoothed photos",
+    "joined": ", with smoothed photos",
+    "tolerant": ", second and more tolerant pass",
+}
+LEAST_SHARE = 0.5  # of the photos must find their place in a model
+LONG, MANY = 60.0, 150  # s, photos: from where on the user is told before it begins
+AGAIN = 4  # times the first pass, that all passes take at most
 
 PROGRAM = Path(__file__).with_name("program.py")
-FORMAT = 1  # of what is kept: raised by hand where other poses or points would be found, or stored otherwise
+FORMAT = 2  # of what is kept: raised by hand where other poses or points would be found, or stored otherwise
 STAGES = {
     "features": "COLMAP: features",
     "matches": "COLMAP: pairs of photos matched",
@@ -77,7 +77,7 @@ class Model:
     """COLMAP's largest model, and what its passes came to: one, or a second, more tolerant one."""
 
     found: pycolmap.Reconstruction
-    passes: list[Pass]
+    passes: list[Outcome]
     called: Mapping[str, str] = field(default_factory=dict)  # what the user calls photos, by COLMAP's names
     chosen: int = 0  # the pass whose model it is
 
@@ -95,7 +95,7 @@ class Model:
         return poses
 
     @property
-    def _chosen(self) -> Pass:
+    def _chosen(self) -> Outcome:
         return self.passes[self.chosen]
 
     def lost(self) -> dict[str, str]:
@@ -268,7 +268,7 @@ def _run_program(directory: Path, on_stage: OnStage) -> None:
         try:
             while True:
                 try:
-                    status = process.wait(LISTEN)
+                    status = process.wait(0.25)
                     break
                 except subprocess.TimeoutExpired:
                     _tell(directory / "stage.json", on_stage)
@@ -288,9 +288,7 @@ def _tell(file: Path, on_stage: OnStage) -> None:
         now: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:  # it has only begun
         return
-    again = ", second and more tolerant pass" if now["tolerant"] else ""
-    again = ", with smoothed photos" if now["smoothed"] else again
-    on_stage(Stage(STAGES[now["stage"]] + again, now["done"], now["total"]))
+    on_stage(Stage(STAGES[now["stage"]] + AGAIN_SAID.get(now["pass"], ""), now["done"], now["total"]))
 
 
 def _read(folder: Path, called: Mapping[str, str]) -> Model:
@@ -298,9 +296,9 @@ def _read(folder: Path, called: Mapping[str, str]) -> Model:
     return Model(pycolmap.Reconstruction(folder), passes, called, chosen)
 
 
-def _passes(facts: Path) -> tuple[list[Pass], int]:
+def _passes(facts: Path) -> tuple[list[Outcome], int]:
     told = json.loads(facts.read_text(encoding="utf-8"))
-    return [Pass(**one) for one in told["passes"]], told["chosen"]
+    return [Outcome(**one) for one in told["passes"]], told["chosen"]
 
 
 def key_of(what: str, pieces: Iterable[bytes]) -> str:

@@ -16,8 +16,11 @@ from scipy.spatial.distance import cdist
 
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.scene import View
-from hqgs.scene.sfm.constants import ALIKE, MATCHED_ALL, PARTNERS, POINTS_WANTED, TRIANGULATION
+from hqgs.scene.sfm.likely import MATCHED_ALL, PARTNERS
 from hqgs.scene.sfm.run import PROGRAM, surroundings
+
+ALIKE = 0.5  # cosine of the angle between the directions in which two photos of more must look, at least
+POINTS_WANTED, TRIANGULATION = 200, 1800.0  # below which there is no basis; s for a COLMAP that hangs
 
 
 class SparsePoints(NamedTuple):

@@ -1,4 +1,4 @@
-"""Observations moved to sub-pixel agreement by normalised patches over all photos of a point.
+"""A model refined: observations moved to sub-pixel agreement by normalised patches, and places checked.
 
 SIFT finds each of them alone, a pixel off where photos are noisy. A point's patch averaged over the photos
 that see it is cleaner than any of them, and each photo is laid against the mean of the others (Gauss-Newton
@@ -10,18 +10,80 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.scene.constants import OUTLIER
-from hqgs.scene.sfm.constants import ANGLE, CELL, GROWN, LAID, PATCH_SIDE, ROUNDS
-from hqgs.scene.sfm.patches import PatchView, aligned, read_photo, widened
-from hqgs.scene.sfm.tracks import Tracks, errors, read_tracks, rebuilt, usual
-from hqgs.scene.sfm.weighted import weighted
+from hqgs.scene.sfm.refine.agree import WEAKLY_JOINT, Agreement, agreement, confirmed, loose_parts
+from hqgs.scene.sfm.refine.patches import PATCH_SIDE, PatchView, aligned, read_photo, widened
+from hqgs.scene.sfm.refine.tracks import Tracks, errors, read_tracks, rebuilt, usual
+from hqgs.scene.sfm.refine.weighted import weighted
+
+ROUNDS, FEWER = 3, 2  # of patches and adjustment; where features are precise already
+UNSURE = 0.3  # px of what SIFT sees that observations are usually off, from where on photos may be bad
+ALWAYS_CHECKED = 16  # photos, whose places are always checked
+LAID = 400  # observations of a photo, of the points whose patches are laid
+CELL = 2.0  # px, where points are the same
+GROWN = 1.3  # times: patches that leave the observations so much farther off do not fit these photos
+ANGLE = pycolmap.IncrementalMapperOptions().filter_min_tri_angle  # degrees between two rays to a point, least
 
 Adjust = Callable[[pycolmap.Reconstruction, float, bool], None]
+
+
+class Adjusting(Protocol):
+    """How models are adjusted: what COLMAP's options of a pass are needed for."""
+
+    @property
+    def fixed(self) -> bool: ...  # whether focal lengths and distortion stay as they are
+    def adjust(self, model: pycolmap.Reconstruction, scale: float, move: bool) -> None: ...
+    def settle(self, model: pycolmap.Reconstruction) -> None: ...
+    def tell(self, stage: str, done: int, total: int = 0) -> None: ...
+
+
+def refined(
+    plain: pycolmap.Reconstruction, folder: Path, work: Adjusting, sure: set[str], photos: int, largest: int
+) -> tuple[pycolmap.Reconstruction, Agreement]:
+    """The model, with observations moved to where the photos of a folder agree, where that is more precise.
+
+    Then what photos show is compared with what they should show, where that may not be the same: the counts
+    by photo. Those that are not `sure`, as weak evidence placed them, do not stay where it is not. `photos`
+    in all were looked for; SIFT saw them at `largest` px at most.
+    """
+    work.tell("sharpen", 0)
+    sides = [max(camera.width, camera.height) for camera in plain.cameras.values()]
+    unsure = usual(plain) * min(1, largest / float(np.median(sides))) > UNSURE
+    model, all_sure = plain, sure >= placed_names(plain)
+    for _ in range(1 if all_sure else 2):  # weaker evidence: farther off
+        model = sharpened(model, folder, work.adjust, not work.fixed, ROUNDS if unsure else FEWER)
+    if model is plain and not all_sure:
+        work.settle(plain)
+    whole = model.num_reg_images() == photos >= ALWAYS_CHECKED
+    if whole and not unsure and not loose_parts(plain, WEAKLY_JOINT):
+        return model, {}
+    work.tell("agree", 0)
+    rest = rebuilt(model, *read_tracks(plain))
+    work.adjust(rest, usual(plain), False)
+    agree = agreement(rest, folder)
+    strange = {name for name, counts in agree.items() if not confirmed(*counts)} - sure
+    if strange:
+        without(model, strange)
+        work.adjust(model, usual(model), True)
+    return model, {name: counts for name, counts in agree.items() if name not in strange}
+
+
+def placed_names(model: pycolmap.Reconstruction) -> set[str]:
+    """The photos that have a place in a model."""
+    return {model.images[k].name for k in model.reg_image_ids()}
+
+
+def without(model: pycolmap.Reconstruction, names: set[str]) -> None:
+    """Take these photos' places away."""
+    for image in [model.images[k] for k in model.reg_image_ids()]:
+        if image.name in names:
+            model.deregister_frame(image.frame_id)
 
 
 def sharpened(

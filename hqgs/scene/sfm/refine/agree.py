@@ -17,9 +17,15 @@ import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hqgs.scene.sfm.constants import DEVIATIONS, JOINT, REACH, SEARCHED, TIMES, WEAKLY_JOINT
-from hqgs.scene.sfm.patches import PatchView, fitted, read_photo, widened
-from hqgs.scene.sfm.tracks import read_tracks
+from hqgs.scene.sfm.refine.patches import REACH, PatchView, fitted, read_photo, widened
+from hqgs.scene.sfm.refine.tracks import read_tracks
+
+SEARCHED = 60  # points of each photo that the others are searched for, those that most photos see
+DEVIATIONS, TIMES = 3.0, 1.5  # by which more must agree at the place than beside it; the same, as a ratio
+# Points that a photo must show, or share with others, to be told by them; parts share 12 and 15 with the rest
+# where they are wrong, 36 and more where right.
+JOINT = 20
+WEAKLY_JOINT = 60  # parts that share fewer are looked for in each other: two like sides of a house share 46
 
 BESIDE = 4 * REACH  # px of the photos that are looked at: there no patch reaches the place
 

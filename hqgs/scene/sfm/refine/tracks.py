@@ -5,13 +5,16 @@ It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's pro
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from hqgs.scene.sfm.constants import POSE_LEAST, RAYLEIGH
+POSE_LEAST = 4  # observations of a photo that tell a pose and more
+RAYLEIGH = math.sqrt(2 * math.log(2))  # median distance of points in a plane that scatter by 1 each way
+
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]

@@ -15,8 +15,16 @@ import pycolmap
 from scipy.sparse import bsr_array, csr_array
 from scipy.spatial.transform import Rotation
 
-from hqgs.scene.sfm.constants import ADJUST_STEPS, ALONG, LEVENBERG, NUDGE, ROBUST, SETTLED, TINY
-from hqgs.scene.sfm.tracks import Floats, Tracks
+from hqgs.scene.sfm.refine.tracks import Floats, Tracks
+
+ADJUST_STEPS, LEVENBERG = 10, 1e-6  # at most; damping, of the diagonal
+ROBUST = 2.0  # medians of the errors, scale of Cauchy's function
+ALONG = 0.1  # of the usual precision; an observation that is less precise some way follows its point there
+NUDGE = 1e-6  # of a depth or parameter, by which slopes are taken
+SETTLED, TINY = (
+    1e-5,
+    1e-12,
+)  # of the cost: a step that gains less is the last; of the diagonal: what stays free
 
 
 def weighted(

@@ -17,23 +17,20 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from hqgs.base.machine import AT_ONCE
 from hqgs.photos.pixels import grey
-from hqgs.scene.sfm.constants import (
-    COARSER,
-    FRONTAL,
-    HALF,
-    NEW,
-    PATCH_PHOTOS,
-    PATCH_SIDE,
-    PATCH_STEPS,
-    REACH,
-    ROUGH,
-    SMOOTH,
-    STILL,
-    SURE,
-    UNLIKE,
-    WINDOW,
-)
-from hqgs.scene.sfm.tracks import Floats, Tracks
+from hqgs.scene.sfm.refine.tracks import Floats, Tracks
+
+HALF = 6  # nodes of a patch to each side of its middle
+WINDOW = 3.5  # nodes, sigma of the weights over a patch
+SMOOTH = 1.0  # px, sigma, of the photos that patches are taken from
+PATCH_SIDE = 1000  # px, of these photos
+PATCH_STEPS, STILL = 5, 0.05  # of Gauss-Newton, at most; nodes, the usual step after which none follows
+REACH = 3.0  # px that an observation may move
+SURE, NEW = 0.6, 0.7  # correlation with the others' mean, of what stays; of what no feature told of
+UNLIKE = 0.3  # of a photo's observations that are sure: with fewer, patches tell nothing of it
+PATCH_PHOTOS = 12  # that a point is looked for in, beside those whose features show it
+FRONTAL = 0.8  # cosine of the angle between a patch's normal and a new ray, least
+COARSER = 2.0  # px of a photo in which a point is looked for, in px of the finest that shows it, most
+ROUGH = 0.02  # of a patch's variance: what no patch fits better than, counted as noise
 
 
 def read_photo(file: Path) -> NDArray[np.float32]:
