@@ -28,7 +28,7 @@ from hqgs.scene.load import load_scene
 from hqgs.scene.named_split import listed_split, names_by_any
 from hqgs.scene.next_photos import next_photos
 from hqgs.scene.scene import Scene, SfmReport
-from hqgs.scene.sfm.failure import Pass, why_lost
+from hqgs.scene.sfm.failure import Outcome, why_doubtful, why_lost
 from hqgs.scene.sfm.likely import likely_pairs
 from hqgs.scene.sfm.run import Model
 from hqgs.scene.sfm.triangulated import SparsePoints, triangulated
@@ -168,9 +168,10 @@ def test_lists_of_a_split_know_folders(tmp_path: Path) -> None:
 
 
 def test_the_pass_whose_model_it_is_is_told() -> None:
-    plain = Pass(False, 10, {"a": 500, "b": 500}, [], [])
-    tolerant = Pass(True, 9, {"a": 500, "b": 500}, [], [], learned=True)
-    assert Model(None, [plain, tolerant], chosen=1).learned  # pyright: ignore[reportArgumentType]
+    plain = Outcome(False, 10, {"a": 500, "b": 500}, [], [])
+    tolerant = Outcome(True, 9, {"a": 500, "b": 500}, [], [], agree={"a": [40, 6, 5]})
+    model = Model(None, [plain, tolerant], chosen=1)  # pyright: ignore[reportArgumentType]
+    assert "of 40 points that one should show it shows 6" in why_doubtful(model.passes[model.chosen])
     group = replace(plain, best={"a": [90, 80, 0]}, apart=[["a", "b", "c"]])
     assert why_lost("a", group) == "fits 2 photos that have no place either"
     assert why_lost("a", group, {"b"}) == "fits one that has no place"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hqgs.scene.constants import OUTLIER
 from hqgs.scene.sfm.refine.agree import WEAKLY_JOINT, Agreement, agreement, confirmed, loose_parts
-from hqgs.scene.sfm.refine.patches import PATCH_SIDE, PatchView, aligned, read_photo, widened
+from hqgs.scene.sfm.refine.patches import PATCH_SIDE, PatchView, aligned, read_photos, widened
 from hqgs.scene.sfm.refine.tracks import Tracks, errors, read_tracks, rebuilt, usual
 from hqgs.scene.sfm.refine.weighted import weighted
 
@@ -36,8 +36,9 @@ Adjust = Callable[[pycolmap.Reconstruction, float, bool], None]
 class Adjusting(Protocol):
     """How models are adjusted: what COLMAP's options of a pass are needed for."""
 
-    @property
-    def fixed(self) -> bool: ...  # whether focal lengths and distortion stay as they are
+    fixed: bool  # whether focal lengths and distortion stay as they are
+    threads: int
+
     def adjust(self, model: pycolmap.Reconstruction, scale: float, move: bool) -> None: ...
     def settle(self, model: pycolmap.Reconstruction) -> None: ...
     def tell(self, stage: str, done: int, total: int = 0) -> None: ...
@@ -57,7 +58,8 @@ def refined(
     unsure = usual(plain) * min(1, largest / float(np.median(sides))) > UNSURE
     model, all_sure = plain, sure >= placed_names(plain)
     for _ in range(1 if all_sure else 2):  # weaker evidence: farther off
-        model = sharpened(model, folder, work.adjust, not work.fixed, ROUNDS if unsure else FEWER)
+        rounds = ROUNDS if unsure else FEWER
+        model = sharpened(model, folder, work.adjust, not work.fixed, rounds, work.threads)
     if model is plain and not all_sure:
         work.settle(plain)
     whole = model.num_reg_images() == photos >= ALWAYS_CHECKED
@@ -66,7 +68,7 @@ def refined(
     work.tell("agree", 0)
     rest = rebuilt(model, *read_tracks(plain))
     work.adjust(rest, usual(plain), False)
-    agree = agreement(rest, folder)
+    agree = agreement(rest, folder, work.threads)
     strange = {name for name, counts in agree.items() if not confirmed(*counts)} - sure
     if strange:
         without(model, strange)
@@ -87,7 +89,12 @@ def without(model: pycolmap.Reconstruction, names: set[str]) -> None:
 
 
 def sharpened(
-    model: pycolmap.Reconstruction, folder: Path, adjust: Adjust, free: bool, rounds: int = ROUNDS
+    model: pycolmap.Reconstruction,
+    folder: Path,
+    adjust: Adjust,
+    free: bool,
+    rounds: int = ROUNDS,
+    threads: int = 1,
 ) -> pycolmap.Reconstruction:
     """The model after `rounds` of patches and adjustment; as it is where the patches do not fit.
 
@@ -97,7 +104,7 @@ def sharpened(
     The points that most photos see, LAID in each photo, make the poses precise; the others follow them.
     """
     names, tracks = read_tracks(model)
-    photos = {name: read_photo(folder / name) for name in names}
+    photos = dict(zip(names, read_photos(folder, names, threads), strict=True))
     before = usual(model)
     sides = [max(camera.width, camera.height) for camera in model.cameras.values()]
     used, fresh = _used(tracks, len(names), CELL * max(1, float(np.median(sides)) / PATCH_SIDE))
@@ -107,7 +114,7 @@ def sharpened(
         new = np.zeros(len(some.view), bool)
         if number > 0:
             some, new = widened(views, some)
-        some, sure, unlike, information = aligned(views, some, new)
+        some, sure, unlike, information = aligned(views, some, new, threads)
         if 2 * unlike.sum() > len(names):
             return model
         keep = some.kept(sure)

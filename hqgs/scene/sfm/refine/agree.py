@@ -17,7 +17,7 @@ import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hqgs.scene.sfm.refine.patches import REACH, PatchView, fitted, read_photo, widened
+from hqgs.scene.sfm.refine.patches import REACH, PatchView, fitted, read_photos, widened
 from hqgs.scene.sfm.refine.tracks import read_tracks
 
 SEARCHED = 60  # points of each photo that the others are searched for, those that most photos see
@@ -32,7 +32,7 @@ BESIDE = 4 * REACH  # px of the photos that are looked at: there no patch reache
 Agreement = dict[str, tuple[int, int, int]]  # of a photo: points looked for, that agree, that agree beside
 
 
-def agreement(model: pycolmap.Reconstruction, folder: Path) -> Agreement:
+def agreement(model: pycolmap.Reconstruction, folder: Path, threads: int = 1) -> Agreement:
     """Of each photo with a place, how many points that it should show it shows; photos are in `folder`."""
     names, tracks = read_tracks(model)
     length = np.bincount(tracks.point, minlength=len(tracks.points))
@@ -40,7 +40,8 @@ def agreement(model: pycolmap.Reconstruction, folder: Path) -> Agreement:
     for k in range(len(names)):
         mine = tracks.point[tracks.view == k]
         longest[mine[np.argsort(-length[mine], kind="stable")[:SEARCHED]]] = True
-    views = [PatchView(model, name, read_photo(folder / name)) for name in names]
+    photos = read_photos(folder, names, threads)
+    views = [PatchView(model, name, photo) for name, photo in zip(names, photos, strict=True)]
     chosen = tracks.chosen(longest[tracks.point])
     should = chosen.xy.copy()
     for k, view in enumerate(views):
@@ -61,7 +62,7 @@ def agreement(model: pycolmap.Reconstruction, folder: Path) -> Agreement:
     shift = np.zeros(some.xy.shape)
     towards = np.where(some.xy[rows, axis] < sizes[rows, axis] / 2, BESIDE, -BESIDE)  # stays in the photo
     shift[rows, axis] = np.where(new, towards / ratios[rows, axis], 0)
-    at, beside = (fitted(views, replace(some, xy=xy), new)[1] for xy in (some.xy, some.xy + shift))
+    at, beside = (fitted(views, replace(some, xy=xy), new, threads)[1] for xy in (some.xy, some.xy + shift))
     all_of_it, others = (
         np.array([np.bincount(some.view[rows & that], minlength=len(names)) for that in (new, at, beside)])
         for rows in (new, foreign)

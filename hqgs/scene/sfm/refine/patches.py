@@ -5,6 +5,8 @@ It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's pro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.sparse import csr_array
 
 from hqgs.base.machine import AT_ONCE
 from hqgs.photos.pixels import grey
@@ -42,6 +45,12 @@ def read_photo(file: Path) -> NDArray[np.float32]:
             size = max(1, round(gray.width * share)), max(1, round(gray.height * share))
             gray = gray.resize(size, Image.Resampling.BOX)
         return np.asarray(gaussian_filter(np.asarray(gray, np.float32), SMOOTH, mode="nearest"), np.float32)
+
+
+def read_photos(folder: Path, names: Sequence[str], threads: int) -> list[NDArray[np.float32]]:
+    """Photos of a folder, as `read_photo` has them."""
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(lambda name: read_photo(folder / name), names))
 
 
 class PatchView:
@@ -107,13 +116,18 @@ def _laid(views: list[PatchView], tracks: Tracks, axes: Floats) -> tuple[Floats,
     return turns, middles
 
 
-def _patches(views: list[PatchView], tracks: Tracks, turns: Floats, at: Floats) -> NDArray[np.float32]:
+def _patches(
+    views: list[PatchView], tracks: Tracks, turns: Floats, at: Floats, pool: Executor
+) -> NDArray[np.float32]:
     """Normalised patches [O, N] around `at` [O, 2]: weighted mean 0 and sum of squares 1."""
     values = np.zeros((len(at), len(_GRID)), np.float32)
-    for k, view in enumerate(views):
+
+    def take(k: int) -> None:
         mine = np.flatnonzero(tracks.view == k)
-        values[mine] = view.sample(at[mine, :, None] + turns[mine] @ _GRID.T)
-    return _normalised(values)
+        values[mine] = _normalised(views[k].sample(at[mine, :, None] + turns[mine] @ _GRID.T))
+
+    list(pool.map(take, range(len(views))))
+    return values
 
 
 def _normalised(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -130,14 +144,25 @@ def _inside(views: list[PatchView], tracks: Tracks, turns: Floats, at: Floats) -
 
 def _means(patches: NDArray[np.float32], tracks: Tracks, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
     """For each observation the mean patch [O, N] of the point's other photos that are counted, normalised."""
-    own = patches * counted[:, None]
-    total = np.zeros((len(tracks.points), patches.shape[1]), np.float32)
-    np.add.at(total, tracks.point, own)
-    return _normalised(total[tracks.point] - own)
+    rows = np.flatnonzero(counted)
+    of_point = csr_array(
+        (np.ones(len(rows), np.float32), (tracks.point[rows], rows)), (len(tracks.points), len(patches))
+    )
+    return _normalised((of_point @ patches)[tracks.point] - patches * counted[:, None])
+
+
+def _slopes(patches: NDArray[np.float32], mean: NDArray[np.float32]) -> Floats:
+    """Of patches [O, N] and those that they are laid against, weighted sums over the nodes [O, 5]: of the
+    latter's slopes squared (xx, xy, yy), and times what the two differ by."""
+    grid = mean.reshape(-1, 2 * HALF + 1, 2 * HALF + 1)
+    x, y = (np.asarray(np.gradient(grid, axis=axis)).reshape(mean.shape) for axis in (2, 1))
+    off, wx, wy = mean - patches, x * _WEIGHTS, y * _WEIGHTS
+    pairs = ((wx, x), (wx, y), (wy, y), (wx, off), (wy, off))
+    return np.stack([(a * b).sum(1, dtype=np.float64) for a, b in pairs], 1)
 
 
 def fitted(
-    views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_]
+    views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_], threads: int = 1
 ) -> tuple[Floats, NDArray[np.bool_], Floats]:
     """Where the patches of observations agree best with those of their points' other photos [O, 2], which of
     them are sure [O], and how precisely each tells its place [O, 2, 2], 1 / px^2: by the slopes of its patch
@@ -148,21 +173,20 @@ def fitted(
     at, counted = tracks.xy, usable & ~new
     reach = REACH / np.array([view.ratio[0] for view in views])[tracks.view, None]
     xx = xy = yy = np.zeros(len(at))
-    for _ in range(PATCH_STEPS):
-        patches = _patches(views, tracks, turns, at)
-        mean = _means(patches, tracks, counted)
-        grid = mean.reshape(-1, 2 * HALF + 1, 2 * HALF + 1)
-        x, y = (np.asarray(np.gradient(grid, axis=axis)).reshape(mean.shape) for axis in (2, 1))
-        off, wx, wy = mean - patches, x * _WEIGHTS, y * _WEIGHTS
-        xx, xy, yy = ((a * b).sum(1, dtype=np.float64) for a, b in ((wx, x), (wx, y), (wy, y)))
-        xo, yo = ((a * off).sum(1, dtype=np.float64) for a in (wx, wy))
-        xx, yy = xx + 1e-6, yy + 1e-6
-        step = np.stack([yy * xo - xy * yo, xx * yo - xy * xo], 1) / (xx * yy - xy**2)[:, None]
-        step /= np.maximum(np.abs(step).max(1, keepdims=True), 1)  # a node at most
-        at = tracks.xy + np.clip(at + np.einsum("oij,oj->oi", turns, step) - tracks.xy, -reach, reach)
-        if 2 * (np.linalg.norm(step[usable], axis=1) > STILL).sum() < usable.sum():
-            break
-    patches = _patches(views, tracks, turns, at)
+    parts = [slice(start, start + 4096) for start in range(0, max(1, len(at)), 4096)]
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in range(PATCH_STEPS):
+            patches = _patches(views, tracks, turns, at, pool)
+            mean = _means(patches, tracks, counted)
+            sums = list(pool.map(_slopes, (patches[part] for part in parts), (mean[part] for part in parts)))
+            xx, xy, yy, xo, yo = np.concatenate(sums).T
+            xx, yy = xx + 1e-6, yy + 1e-6
+            step = np.stack([yy * xo - xy * yo, xx * yo - xy * xo], 1) / (xx * yy - xy**2)[:, None]
+            step /= np.maximum(np.abs(step).max(1, keepdims=True), 1)  # a node at most
+            at = tracks.xy + np.clip(at + np.einsum("oij,oj->oi", turns, step) - tracks.xy, -reach, reach)
+            if 2 * (np.linalg.norm(step[usable], axis=1) > STILL).sum() < usable.sum():
+                break
+        patches = _patches(views, tracks, turns, at, pool)
     alike = (patches * _means(patches, tracks, counted) * _WEIGHTS).sum(1)
     near = (np.abs(at - tracks.xy) < reach).all(1)
     slopes = np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2)
@@ -173,14 +197,14 @@ def fitted(
 
 
 def aligned(
-    views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_]
+    views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_], threads: int = 1
 ) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_], Floats]:
     """Observations moved to where they are `fitted`, which of them are sure [O], which photos look unlike the
     others [V], and the precision of each [O, 2, 2].
 
     A photo of which few are sure is unlike: its own stay where features had them, usually precise each way.
     """
-    at, sure, information = fitted(views, tracks, new)
+    at, sure, information = fitted(views, tracks, new, threads)
     known = np.bincount(tracks.view[~new], minlength=len(views))
     unlike = np.bincount(tracks.view[~new & sure], minlength=len(views)) < UNLIKE * known
     stay = unlike[tracks.view]

@@ -162,14 +162,21 @@ class _Problem:
         order = np.arange(len(self.point) + 1)
         G = bsr_array((by_point, self.point, order), shape=(len(wrong), 3 * points)).tocsr()
         whole, mixed = (J.T @ J).toarray(), (J.T @ G).tocsr()
-        blocks = np.zeros((points, 3, 3))
-        np.add.at(blocks, self.point, np.swapaxes(by_point, 1, 2) @ by_point)
+        whole_points = csr_array(
+            (np.ones(len(self.point)), (self.point, order[:-1])), (points, len(self.point))
+        )
+        blocks = whole_points @ (np.swapaxes(by_point, 1, 2) @ by_point).reshape(-1, 9)
+        blocks = blocks.reshape(points, 3, 3)
         for diagonal in (np.einsum("ii->i", whole), np.einsum("pii->pi", blocks)):
             diagonal *= 1 + damping
             diagonal += TINY * diagonal.max()  # the frame as a whole is free
         inverse = bsr_array((np.linalg.inv(blocks), np.arange(points), np.arange(points + 1))).tocsr()
         out = mixed @ inverse
-        moves = np.linalg.solve(whole - (out @ mixed.T).toarray(), -(J.T @ wrong) + out @ (G.T @ wrong))
+        if mixed.nnz > 0.1 * own * 3 * points:  # then dense products are faster
+            shared = out.toarray() @ mixed.toarray().T
+        else:
+            shared = (out @ mixed.T).toarray()
+        moves = np.linalg.solve(whole - shared, -(J.T @ wrong) + out @ (G.T @ wrong))
         back = inverse @ -(G.T @ wrong + mixed.T @ moves)
 
         turns, shifts = np.split(moves[: 6 * photos].reshape(photos, 6), 2, axis=1)
