@@ -88,6 +88,11 @@ def lines_of(part: Part) -> int:
     return sum(map(length, [*whole, *(place for place in part.modules if ":" in place)]))
 
 
+def told(part: Part) -> Run:
+    """What the table says of a part, also after it has left."""
+    return {"what": part.what, "lines": lines_of(part)}
+
+
 class Parts:
     """The runs of a study."""
 
@@ -107,7 +112,7 @@ class Parts:
             known = self.study.runs.get(self.whole[cell.group])
             if known is not None and known["start"] == start:
                 whole = {name: float(known[name]) for name in MEASURES}
-                return whole | {"on": False, "start": start, "lines": lines_of(part)}
+                return whole | {"on": False, "start": start} | told(part)
             done.steps()
         placed = len(photos.train) + len(photos.test)
         cpu = done.setup_cpu_seconds + done.cpu_seconds
@@ -115,7 +120,7 @@ class Parts:
         whole = {name: found[name] for name in MEASURES}
         same = ("psnr", "ssim", "gaussians")
         on = part.label == ALL or known is None or any(text_of(whole[one]) != known[one] for one in same)
-        return whole | {"on": on, "start": start, "lines": lines_of(part)}
+        return whole | {"on": on, "start": start} | told(part)
 
     def placed_anew(self, cell: Cell) -> Scene:
         """The scene with cameras that are found without the part."""
@@ -155,21 +160,19 @@ def lengths(runs: DataFrame) -> str:
 
 
 def parts_table(runs: DataFrame) -> str:
-    """A line for each part that was measured, the largest gain first; of parts that have left, too."""
+    """A line for each part that was measured, the largest gain first."""
     body = list[tuple[float, list[str]]]()
     for label in dict.fromkeys(runs["row"]):
-        mine, part = pick(runs, row=label), PARTS.get(label)
+        mine = pick(runs, row=label)
         if label == ALL:
             continue
         psnr, ssim, seconds, placed = (
             gains_of(runs, label, name) for name in ("psnr", "ssim", "cpu_seconds", "placed")
         )
         scenes = mine.groupby("scene")["on"].any()
-        lines = mine["lines"].max()
-        cells = [f"{label}: {part.what}" if part else f"{label} (has left)", number(lines or None, ".0f")]
+        cells = [f"{label}: {mine['what'].iloc[-1]}", number(mine["lines"].max() or None, ".0f")]
         cells += [f"{scenes.sum():.0f} of {len(scenes)}", psnr.text(), ssim.text("+.3f")]
-        cells.append(number(seconds.mean, "+.0f"))
-        cells.append(f"{placed.runs['gain'].sum():+.0f}" if part and part.poses and placed.count else "")
+        cells += [number(seconds.mean, "+.0f"), number(placed.runs["gain"].sum() or None, "+.0f")]
         body.append((psnr.mean if psnr.count else float("-inf"), cells))
     heads = ("part", "lines", "on in", "PSNR (dB)", "SSIM", "CPU (s)", "photos placed")
     return table(heads, [cells for _, cells in sorted(body, key=lambda one: -one[0])])

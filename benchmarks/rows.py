@@ -62,6 +62,7 @@ TEXT = (
         "sources",
         "digest",
         "start",
+        "what",
     ),
 )
 DIGITS = ".7g"

@@ -73,6 +73,7 @@ def test_a_part_gains_only_where_it_is_on() -> None:
         cpu_seconds=2.0,
         placed=3,
         lines=7,
+        what="flat",
     )
     assert (gains_of(runs, "discs").mean, gains_of(runs, "discs").count) == (1.0, 1)
-    assert "| 7 | 1 of 2 | +1.00 | +0.000 | +0 |" in parts_table(runs)
+    assert "| discs: flat | 7 | 1 of 2 | +1.00 | +0.000 | +0 |" in parts_table(runs)
