@@ -233,7 +233,7 @@ def change_gltf(path: Path, change: Any) -> None:
     ("change", "message"),
     [
         (lambda c: c["nodes"][0].update(scale=[1, 0, 1]), "a map that is singular"),
-        (lambda c: c["nodes"][0].update(rotation=[0, 0, 0, "x"]), "no Gaussians that can be read"),
+        (lambda c: c["nodes"][0].update(rotation=[0, 0, 0, "x"]), "a node has no map of space"),
         (lambda c: c["nodes"][0].update(children=[0]), "no tree"),
         (lambda c: c["meshes"][0]["primitives"][0].pop("extensions"), "no primitive with KHR_gaussian"),
         (lambda c: c["accessors"][1].update(componentType=5122), "accessor 1 is not VEC4 of float32"),

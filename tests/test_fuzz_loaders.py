@@ -30,7 +30,7 @@ from test_ply import random_gaussians
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.evaluation.records import read_report
-from hqgs.model.formats.sog_writer import encode_sog
+from hqgs.model.formats.sog import encode_sog
 from hqgs.model.formats.spz import write_spz
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import load_cameras, load_path, save_cameras, save_path

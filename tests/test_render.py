@@ -15,7 +15,7 @@ from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 import hqgs
 from hqgs.cli import main as cli
-from hqgs.model.formats.rows import curve_order
+from hqgs.model.formats.arrays import curve_order
 from hqgs.scene.camera_files import KnownCamera, load_cameras, picked, save_path
 from hqgs.scene.paths import with_size
 from hqgs.show import frames, trust

@@ -14,7 +14,7 @@ import torch
 
 import hqgs
 from hqgs.model.formats import gltf
-from hqgs.model.formats.rows import curve_order
+from hqgs.model.formats.arrays import curve_order
 
 
 def some(n: int = 200, **changes: Any) -> hqgs.Gaussians:

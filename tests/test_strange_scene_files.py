@@ -113,5 +113,5 @@ def test_a_damaged_archive_gets_a_sentence(tmp_path: Path) -> None:
         packed.writestr("meta.json", "{}")
     whole = path.read_bytes()
     path.write_bytes(whole.replace(b"PK\1\2", b"PK\1\3"))  # its list of files; the end of it is found
-    with pytest.raises(ValueError, match=r"scene\.sog: not a readable SOG scene"):
+    with pytest.raises(ValueError, match=r"scene\.sog: not a readable sog file"):
         Gaussians.load(path)

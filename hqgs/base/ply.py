@@ -1,9 +1,10 @@
-"""The vertices of a PLY file, whatever they are."""
+"""The header and the elements of a PLY file, whatever they are."""
 
 from __future__ import annotations
 
 import io
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,35 @@ import numpy as np
 from plyfile import PlyData, PlyParseError
 
 MAX_HEADER_BYTES = 1 << 16
+_END = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r|\Z)")  # a line: a comment may have the word, too
 _TYPES = {1: "char uchar int8 uint8", 2: "short ushort int16 uint16", 8: "double float64"}
 _TYPES[4] = "int uint int32 uint32 float float32"
 SIZES = {name: size for size, names in _TYPES.items() for name in names.split()}  # bytes of a value
+
+
+@dataclass(frozen=True)
+class Header:
+    """The lines of a PLY file before its data."""
+
+    lines: list[str]
+    size: int  # bytes, to where the data begins
+    ascii: bool
+
+    @property
+    def comments(self) -> list[str]:
+        """What the lines say that begin with `comment` or `obj_info`."""
+        words = (line.split(None, 1) for line in self.lines)
+        return [text[1].strip() for text in words if len(text) > 1 and text[0] in ("comment", "obj_info")]
+
+
+def header_of(path: Path) -> Header:
+    """The header of a PLY file. ValueError, which names the file, where it has none that ends."""
+    with path.open("rb") as f:
+        head = f.read(MAX_HEADER_BYTES)
+    end = _END.search(head)
+    if not head.startswith(b"ply") or end is None:
+        raise ValueError(f"{path}: not a PLY file (no header that ends within {MAX_HEADER_BYTES} bytes)")
+    return Header(head[: end.start()].decode("latin-1").splitlines(), end.end(), head[: end.end()].isascii())
 
 
 def read_vertices(path: str | Path) -> np.ndarray[Any, np.dtype[np.void]]:
@@ -33,12 +60,26 @@ def read_vertices(path: str | Path) -> np.ndarray[Any, np.dtype[np.void]]:
 def read_elements(path: str | Path) -> dict[str, np.ndarray[Any, np.dtype[np.void]]]:
     """All elements by name; see `read_vertices`."""
     path = Path(path)
-    head = _check_header(path)
+    header = header_of(path)
+    promised = rows = most = 0
+    for line in header.lines:
+        words = line.split()
+        if words[:1] == ["element"]:
+            if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 18:
+                raise ValueError(f"{path}: not a readable PLY file: its header has the line {line[:80]!r}")
+            rows = int(words[2])
+            most = max(most, rows)
+        elif words[:1] == ["property"]:
+            promised += rows  # a value takes at least one byte in every PLY format
+    if max(promised, most) > (size := path.stat().st_size):
+        raise ValueError(
+            f"{path}: the header promises {max(promised, most)} values, the file has {size} bytes"
+        )
     try:
-        if head.isascii():
+        if header.ascii:
             ply = PlyData.read(str(path))
         else:
-            with _Plain(path, len(head)) as stream:
+            with _Plain(path, header.size) as stream:
                 ply = PlyData.read(stream)
     except (PlyParseError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{path}: not a readable PLY file: {error}") from error
@@ -58,46 +99,15 @@ class _Plain(io.BufferedReader):
         return found[:rest].decode("latin-1").encode("ascii", "replace") + found[rest:]
 
 
-def _check_header(path: Path) -> bytes:
-    """The header, of a file that can hold what that promises. ValueError that names the file."""
-    with path.open("rb") as f:
-        head = f.read(MAX_HEADER_BYTES)
-    size = path.stat().st_size
-    end = head.find(b"end_header")
-    if not head.startswith(b"ply") or end < 0:
-        raise ValueError(f"{path}: not a PLY file (no header that ends within {MAX_HEADER_BYTES} bytes)")
-    promised = rows = most = 0
-    for line in head[:end].splitlines():
-        words = line.split()
-        if words[:1] == [b"element"]:
-            if len(words) != 3 or not words[2].isdigit() or len(words[2]) > 18:
-                raise ValueError(f"{path}: not a readable PLY file: its header has the line {line[:80]!r}")
-            rows = int(words[2])
-            most = max(most, rows)
-        elif words[:1] == [b"property"]:
-            promised += rows  # a value takes at least one byte in every PLY format
-    if max(promised, most) > size:
-        raise ValueError(
-            f"{path}: the header promises {max(promised, most)} values, the file has {size} bytes"
-        )
-    last = re.search(rb"[\r\n]end_header", head)  # a comment may have the word, too
-    return head[: last.end()] if last else b""
-
-
-def header_of(path: Path) -> tuple[list[str], int]:
-    """The comments of a PLY file, and how many bytes follow its last element; 0 where lists hide that."""
-    with path.open("rb") as f:
-        head = f.read(MAX_HEADER_BYTES)
-    end = head.find(b"\n", head.find(b"end_header")) + 1
-    lines = head[:end].decode("latin-1").splitlines()
-    comments = [line.removeprefix("comment ") for line in lines if line.startswith("comment ")]
+def bytes_after(path: Path, header: Header) -> int:
+    """How many bytes follow the last element; 0 where text or lists hide that."""
     rows = size = 0
-    for words in (line.split() for line in lines):
+    for words in (line.split() for line in header.lines):
         if words[:1] == ["element"]:
             rows = int(words[2])
         elif words[:1] == ["property"]:
             if words[1] not in SIZES:
-                return comments, 0
+                return 0
             size += rows * SIZES[words[1]]
-    text = any(line.startswith("format ascii") for line in lines)
-    return comments, 0 if text else max(0, path.stat().st_size - end - size)
+    text = any(line.startswith("format ascii") for line in header.lines)
+    return 0 if text else max(0, path.stat().st_size - header.size - size)

@@ -87,7 +87,7 @@ def run(args: ExportScene) -> int:
         if args.trust:
             from hqgs.show.trust import trust_of
 
-            gaussians.errors = trust_of(gaussians, run.cameras).errors.clamp(max=1)
+            gaussians.errors = trust_of(gaussians, gaussians.along(run.cameras)).errors.clamp(max=1)
 
         def held_out(shown: Gaussians) -> float | None:
             if scene is None:

@@ -32,7 +32,7 @@ META = "meta.json"  # of a SOG scene that was unpacked
 class Judge:
     """Options of `hqgs judge`."""
 
-    source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """A scene file of this or another program, or the folder of a run."""
     photos: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
     """The photos with their cameras, in the frame of the scene file (those that the run was trained on)."""
@@ -48,10 +48,6 @@ class Judge:
     """Behind everything; 1 is white (that of the run, or black)."""
     fit_cameras: bool = False
     """Also measure with each camera fitted to the scene, some 10 s a photo: what poses cost is set aside."""
-    kit: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None
-    """Write a kit to test viewers with: scenes, cameras, right pictures; with --viewer: the kit shown."""
-    viewer: Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")] = None
-    """Name what is wrong in a viewer's screenshots of the kit: a picture, or a folder, named as the kit's."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None
     """Also write judge.json and judge.html, a page with photos against renders, into this folder."""
 
@@ -61,11 +57,7 @@ OPTIONS = Judge
 
 def run(options: Judge) -> int:
     """Measure and say how good it is; return the exit code (0 done, 1 failed, 2 bad input)."""
-    if options.kit is not None or options.viewer is not None:
-        return viewers(options)
     try:
-        if options.source is None:
-            raise ValueError("missing: SOURCE, a scene file or the folder of a run (hqgs judge --help)")
         if options.background is not None:
             check_background(options.background)
         if options.out is not None:
@@ -117,37 +109,6 @@ def run(options: Judge) -> int:
     print(told(found))
     if options.out is not None:
         print(f"\n{options.out / PAGE}: photos against renders, and where the errors are")
-    return 0
-
-
-def viewers(options: Judge) -> int:
-    """Write a kit, or judge a viewer's screenshots of one."""
-    folder, shots = options.kit, options.viewer
-    try:
-        if options.source is not None:
-            raise ValueError(f"--kit and --viewer take no scene of your own, got {options.source}")
-        if folder is None:
-            raise ValueError("--viewer needs --kit DIR, the kit that the viewer has shown")
-        if options != Judge(kit=folder, viewer=shots):
-            raise ValueError("--kit takes no other option than --viewer")
-        from hqgs.evaluation.viewers.faults import Imitations
-        from hqgs.evaluation.viewers.kit import kit_file, read_screenshot, screenshots, write_kit
-        from hqgs.scene.camera_files import load_cameras
-
-        if shots is None:
-            print(f"{folder}: {', '.join(write_kit(folder))}")
-            return 0
-        cameras = load_cameras(folder).test
-        for which, files in screenshots(shots, len(cameras)).items():
-            pictures = {number: read_screenshot(file) for number, file in files.items()}
-            verdict = Imitations(kit_file(folder, which), cameras).verdict(pictures)
-            number, row, column = verdict.worst
-            print(f"{which}, {len(files)} of {len(cameras)} pictures: {verdict}", flush=True)
-            print(f"  most in {files[number].name}, row {row}, column {column}")
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{folder}: {error}")
     return 0
 
 

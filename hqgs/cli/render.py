@@ -59,7 +59,7 @@ class Render:
     background: Color = None
     """Behind everything; 1 is white (that of the run, or black)."""
     up: Vector = None
-    """Where up is, of an orbit (that of the cameras; 0 -1 0 in a scene file without)."""
+    """Where up is, of an orbit (that of the cameras, or what the scene file says; else 0 -1 0)."""
 
 
 OPTIONS = Render
@@ -151,7 +151,7 @@ def _cameras(
     from hqgs.scene.paths import UP, camera_path
 
     source, views, path, frames = options.source, options.views, options.path, options.frames
-    known = run.cameras
+    known = gaussians.along(run.cameras)
     count = FRAMES if frames is None else frames
     if views is not None:
         if known is None:
@@ -167,9 +167,9 @@ def _cameras(
         if not Path(path).is_file():
             raise FileNotFoundError(f"--path is {path!r}: no such file, and none of: {', '.join(PATHS)}")
         own, rate = load_path(path)
-        return None, [moved(camera, gaussians.world) for camera in own], rate
+        return None, [moved(camera, gaussians.world, gaussians.moved) for camera in own], rate
     if known is None or not known.train:
-        return None, orbit(gaussians, count, up=UP if options.up is None else options.up), FPS
+        return None, orbit(gaussians, count, up=options.up or gaussians.world.up or UP), FPS
     if options.up is not None and path != "orbit":
         raise ValueError("--up is of an orbit (--path orbit); a way through the cameras looks as they do")
     up = known.up if options.up is None else options.up
@@ -182,7 +182,7 @@ def _trust(options: Render, gaussians: Gaussians, run: RunFolder) -> Trust:
     from hqgs.show.trust import trust_of
     from hqgs.show.trust_measured import measure_trust
 
-    known = run.cameras
+    known = gaussians.along(run.cameras)
     if known is None and gaussians.errors is None:
         raise ValueError(
             f"--show trust: {options.source} has no cameras.json and photos/, as a run has, nor errors "
@@ -204,7 +204,7 @@ def _predicted(
     from hqgs.show.trust import trust_of
     from hqgs.show.trust_measured import predict_psnr
 
-    known = run.cameras
+    known = gaussians.along(run.cameras)
     if len(cameras) < 2 or known is None:
         return None
     kept = [view.held_out for view in known.views if view.photo is not None and view.photo.is_file()]

@@ -56,7 +56,7 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
         heed_endings()
         gaussians, run = Gaussians.load(file), RunFolder.open(file)
         report, title = run.report, run.folder.resolve().name
-        viewer = Viewer(run.cameras, run.folder, port=options.port, title=title, source=options.source)
+        viewer = Viewer(gaussians.along(run.cameras), run.folder, port=options.port, title=title, source=options.source)
     except BAD_INPUT as error:
         return fail(2, error)
     try:

@@ -29,12 +29,6 @@ FIT_STEPS = 10  # at each of them, at most
 DIFFERENCE = 0.3  # px by which a camera is moved to see what that changes
 SETTLED = 1e-4  # of the squared error; less gained ends a level
 
-# Faults of viewers: with these all are told apart in five scenes (`tests/test_viewers.py`).
-ROUNDED = 0.4  # levels, root mean square: rounding to 8 bits leaves 0.29, float32 a little more
-WHOLLY = 0.5  # of the difference to the right picture: an imitation that leaves more explains nothing
-APART = 0.7  # of what the next fault's imitation leaves: nearer ones are not told apart
-SEARCH_STEPS, SEARCH_ROUNDS = 6, 4  # values that are tried between two, and how often closer together
-
 # Pictures.
 AMPLIFICATION = 4  # times: so much larger differences and trajectories are drawn
 PNG_LEVEL = 2  # a tenth larger than zlib's default makes it, in two thirds of the time

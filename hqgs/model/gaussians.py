@@ -30,7 +30,7 @@ from hqgs.model.formats.arrays import TENSORS, Arrays
 from hqgs.model.formats.files import format_of, read_scene, scene_file, write_scene
 from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.photos.pixels import png
-from hqgs.scene.camera_files import first_camera
+from hqgs.scene.camera_files import RunCameras, first_camera, moved_along
 from hqgs.scene.constants import BACKGROUND, SMALLEST, USUAL
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
@@ -56,6 +56,7 @@ class Gaussians:
     antialiased: bool = field(default=False, init=False, compare=False)  # rendered with that compensation
     errors: Tensor | None = field(default=None, init=False, compare=False)  # [N], of trust, white is 1
     notes: list[str] = field(default_factory=list, init=False, compare=False)  # of the file it was read from
+    moved: NDArray[np.float64] | None = field(default=None, init=False, compare=False)  # see `moved_along`
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
@@ -73,7 +74,7 @@ class Gaussians:
     def _repr_png_(self) -> bytes | None:
         """The picture that a notebook shows: from `look`, or of the whole scene; None where it is empty."""
         try:
-            camera = self.look or around(self.means, self.opacities, 4, UP, None)[0]
+            camera = self.look or around(self.means, self.opacities, 4, self.world.up or UP, None)[0]
         except ValueError:
             return None
         with torch.no_grad():
@@ -102,7 +103,7 @@ class Gaussians:
         """Others with these tensors, in the same frame and seen in the same way."""
         made = Gaussians(**tensors)
         made.look, made.world = self.look, self.world
-        made.antialiased, made.notes = self.antialiased, self.notes
+        made.antialiased, made.notes, made.moved = self.antialiased, self.notes, self.moved
         if self.errors is not None and len(self.errors) == len(made):
             made.errors = self.errors
         return made
@@ -117,6 +118,12 @@ class Gaussians:
         made = self.like(self.named() | held)
         made.world, made.look = world, None
         return made
+
+    def along(self, known: RunCameras | None) -> RunCameras | None:
+        """The cameras that lie beside the scene's file, with the scene where another program moved that."""
+        if known is None or self.moved is None:
+            return known
+        return moved_along(known, self.world, self.moved)
 
     def near_plane(self) -> float:
         """What is nearer to a camera than this is not rendered: less in a scene of small units."""
@@ -260,6 +267,7 @@ class Gaussians:
         made.look = first_camera(file.parent) if file.name == PLY else None
         made.world = arrays.get("world", made.world)
         made.antialiased, made.notes = arrays.get("antialiased", False), arrays.get("notes", [])
+        made.moved = arrays.get("moved")
         if "errors" in arrays:
             made.errors = torch.from_numpy(arrays["errors"])
         return made

@@ -185,19 +185,45 @@ def _file(folder: Path, name: Any) -> Path | None:
     return folder / parts if (folder / parts).is_file() else None
 
 
-def moved(camera: Camera, world: World) -> Camera:
-    """A camera of a file in the frame in which its scene is held."""
-    return replace(camera, viewmat=world.viewmat_into(camera.viewmat))
+def moved(camera: Camera, world: World, by: NDArray[np.float64] | None = None) -> Camera:
+    """A camera of a file in the frame in which its scene is held.
+
+    `by` [4, 4]: how the scene was moved on reading (`Gaussians.moved`): its cameras, and paths, go with it.
+    ValueError for a map that stretches or mirrors, where no camera can follow.
+    """
+    viewmat = camera.viewmat
+    if by is not None:
+        size = np.linalg.norm(by[0, :3])
+        turn = by[:3, :3] / size
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
+            raise ValueError("the scene's file stretches or mirrors it, where no camera can follow")
+        viewmat = view_matrix(viewmat[:3, :3] @ turn.T, by[:3, :3] @ camera.center + by[:3, 3])
+    return replace(camera, viewmat=world.viewmat_into(viewmat))
+
+
+def moved_along(known: RunCameras, world: World, by: NDArray[np.float64]) -> RunCameras:
+    """The cameras of a run with its scene, which was moved and is held in `world`; see `moved`."""
+
+    def along(view: KnownCamera) -> KnownCamera:
+        own = replace(view.camera, viewmat=known.world.viewmat_out(view.camera.viewmat))
+        return replace(view, camera=moved(own, world, by))
+
+    up = by[:3, :3] @ known.up
+    return replace(known, up=up / np.linalg.norm(up), views=[*map(along, known.views)], world=world)
 
 
 def save_path(
-    path: str | Path, cameras: Sequence[Camera], fps: float = FPS, world: World | None = None
+    path: str | Path,
+    cameras: Sequence[Camera],
+    fps: float = FPS,
+    world: World | None = None,
+    by: NDArray[np.float64] | None = None,
 ) -> None:
     """Write a camera path as JSON, in the style of nerfstudio's camera_path files, atomically.
 
-    Poses are camera to world with OpenGL's axes, in the frame of the scene's files (`world`); `fov` is
-    vertical, in degrees.
-    Principal points are taken for the middle. ValueError without a camera.
+    Poses are camera to world with OpenGL's axes, in the frame of the scene's file (`world`, and `by` as for
+    `moved`); `fov` is vertical, in degrees. Principal points are taken for the middle. ValueError without a
+    camera.
     """
     if not cameras:
         raise ValueError("cameras is empty, wanted at least one")
@@ -205,6 +231,8 @@ def save_path(
     for camera in cameras:
         if world is not None:
             camera = replace(camera, viewmat=world.viewmat_out(camera.viewmat))
+        if by is not None:
+            camera = moved(camera, World(), np.linalg.inv(by))
         pose = np.eye(4)
         pose[:3, :3] = camera.viewmat[:3, :3].T @ _FLIP
         pose[:3, 3] = camera.center
@@ -222,15 +250,18 @@ def save_path(
 
 
 def load_path(path: str | Path) -> tuple[list[Camera], float]:
-    """Read a camera path: its cameras, in the frame of the scene's files (`moved`), and frames per second.
+    """Read a camera path: its cameras, in the frame of the scene's file (`moved`), and frames per second.
 
-    Raises FileNotFoundError, or ValueError that names the file.
+    Raises FileNotFoundError, or ValueError that names the file: damaged, or not of perspective cameras.
     """
     path = Path(path)
     value = read_json(path)
     try:
         width, height, fps = value["render_width"], value["render_height"], float(value.get("fps", FPS))
         frames = value["camera_path"]
+        for one in (value, *frames):
+            if (kind := one.get("camera_type", "perspective")) != "perspective":
+                raise ValueError(f"camera_type is {kind!r}, drawn here are perspective cameras alone")
         if not 0 < len(frames) <= MOST_FRAMES:
             raise ValueError(f"{len(frames)} frames")
         if not 0 < fps <= 1000:

@@ -19,11 +19,11 @@ from torch import Tensor
 
 from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
 from hqgs.base.left_out import LeftOut
+from hqgs.model.formats.arrays import curve_order
+from hqgs.model.formats.beside import keep_world
 from hqgs.model.formats.files import FORMATS
-from hqgs.model.formats.rows import curve_order
-from hqgs.model.formats.sog_writer import encode_sog
+from hqgs.model.formats.sog import encode_sog
 from hqgs.model.formats.spz import encode_spz, write_spz
-from hqgs.model.formats.world_file import keep_world
 from hqgs.model.gaussians import Gaussians
 from hqgs.show.constants import BAND_SHARE
 from hqgs.show.export_options import ExportOptions

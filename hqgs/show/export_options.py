@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from hqgs.model.constants import MAX_SH_DEGREE
 from hqgs.model.formats.files import WRITTEN
-from hqgs.model.formats.spz import SH_BITS, VERSION
-from hqgs.model.formats.spz_container import VERSIONS
+from hqgs.model.formats.spz import SH_BITS, VERSIONS
 
 
 @dataclass(frozen=True)
@@ -19,7 +18,7 @@ class ExportOptions:
     sh_degree: int = MAX_SH_DEGREE  # at most
     band_tolerance: float = 0.004  # of a colour, white at 1: a level of an 8-bit picture; 0: every band stays
     sh_bits: tuple[int, int] = SH_BITS  # SPZ: of the coefficients of degree 1, and of degrees 2 and 3
-    spz_version: int = VERSION
+    spz_version: int = VERSIONS[0]
 
     def __post_init__(self) -> None:
         if self.format not in WRITTEN:

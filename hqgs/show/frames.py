@@ -19,7 +19,7 @@ from hqgs._rust import EPS2D, FAR_PLANE
 from hqgs.base.evenly import evenly
 from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
-from hqgs.model.formats.rows import curve_order
+from hqgs.model.formats.arrays import curve_order
 from hqgs.model.formats.turned import matrices
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization

@@ -23,18 +23,19 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from hqgs.base.files import atomic_path
-from hqgs.base.ply import MAX_HEADER_BYTES, read_elements
-from hqgs.model.constants import MAX_SH_DEGREE, SH_C0
-from hqgs.model.formats.arrays import Arrays
-from hqgs.model.formats.rows import (
-    curve_order,
-    finite_rows,
+from hqgs.base.ply import header_of, read_elements
+from hqgs.model.constants import MAX_SH_DEGREE
+from hqgs.model.formats.arrays import (
+    Arrays,
+    of_colors,
     of_smallest_three,
-    pick,
+    shown,
     smallest_three,
     to_logits,
     to_opacities,
+    writable,
 )
+from hqgs.model.formats.ply_comments import comments_of, told_by
 
 CHUNK = 256
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -46,19 +47,16 @@ _COUNTS = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]
 _BITS, _TURN_BITS = (11, 10, 11), (10, 10, 10)  # above those of a rotation: which component is left out
 
 
-def write_compressed_ply(path: str | Path, arrays: Arrays) -> int:
+def write_compressed_ply(path: Path, arrays: Arrays) -> int:
     """Write atomically along a curve through space, without rows that hold NaN or Inf; return how many."""
-    finite = finite_rows(arrays)
-    g = pick(arrays, finite)
-    g = pick(g, curve_order(g["means"]))
+    g, left_out = writable(arrays, curve=True)
     n = len(g["means"])
-    colors = 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64)
     logs = g["scales"].astype(np.float64).clip(-LOG_LIMIT, LOG_LIMIT)
     starts, chunk = np.arange(0, n, CHUNK), np.arange(n) // CHUNK
     chunks = np.zeros(len(starts), [(name, "<f4") for name in BOUNDS])
     words = np.zeros(n, [(name, "<u4") for name in WORDS])
     shares = []
-    for k, values in enumerate((g["means"].astype(np.float64), logs, colors)):
+    for k, values in enumerate((g["means"].astype(np.float64), logs, shown(g["sh0"]))):
         names = BOUNDS[6 * k : 6 * k + 6]
         low = np.minimum.reduceat(values, starts).astype("<f4") if n else values
         high = np.maximum.reduceat(values, starts).astype("<f4") if n else values
@@ -79,35 +77,31 @@ def write_compressed_ply(path: str | Path, arrays: Arrays) -> int:
         levels = np.floor((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8)
         names = [(f"f_rest_{k}", "u1") for k in range(count)]
         elements.append(PlyElement.describe(np.ascontiguousarray(levels).view(names)[:, 0], "sh"))
+    comments = comments_of({"antialiased": arrays.get("antialiased", False)})  # its frame is said beside it
     with atomic_path(path) as tmp:
-        PlyData(elements, byte_order="<").write(str(tmp))
-    return int(len(finite) - n)
+        PlyData(elements, byte_order="<", comments=comments).write(str(tmp))
+    return left_out
 
 
-def is_compressed_ply(path: str | Path) -> bool:
+def is_compressed_ply(path: Path) -> bool:
     """Whether the header of a PLY file says so."""
-    with Path(path).open("rb") as file:
-        return b"packed_position" in file.read(MAX_HEADER_BYTES).partition(b"end_header")[0]
+    return any("packed_position" in line for line in header_of(path).lines if "property" in line)
 
 
-def read_compressed_ply(path: str | Path) -> Arrays:
-    """Read such a file: float32 arrays.
-
-    Raises FileNotFoundError, or ValueError that names the file where it is damaged.
-    """
-    path = Path(path)
-    elements = read_elements(path)
+def read_compressed_ply(path: Path) -> Arrays:
+    """Read such a file. ValueError where it is damaged."""
+    told, elements = told_by(header_of(path).comments), read_elements(path)
     if "vertex" not in elements or "chunk" not in elements:
-        raise ValueError(f"{path}: a compressed PLY file has the elements chunk and vertex")
+        raise ValueError("a compressed PLY file has the elements chunk and vertex")
     vertices, chunks = elements["vertex"], elements["chunk"]
     n = len(vertices)
-    words = _columns(path, vertices, WORDS, "u").astype(np.uint32)
+    words = _columns(vertices, WORDS, "u").astype(np.uint32)
     colored = "min_r" in (chunks.dtype.names or ())
-    bounds = _columns(path, chunks, BOUNDS if colored else BOUNDS[:12], "f").astype(np.float64)
+    bounds = _columns(chunks, BOUNDS if colored else BOUNDS[:12], "f").astype(np.float64)
     if len(bounds) * CHUNK < n:
-        raise ValueError(f"{path}: {len(bounds)} chunks of {CHUNK} are too few for {n:,} Gaussians")
+        raise ValueError(f"{len(bounds)} chunks of {CHUNK} are too few for {n:,} Gaussians")
     if not np.isfinite(bounds).all():
-        raise ValueError(f"{path}: a bound of a chunk is not finite")
+        raise ValueError("a bound of a chunk is not finite")
     if not colored:
         bounds = np.concatenate([bounds, np.tile([0.0] * 3 + [1.0] * 3, (len(bounds), 1))], axis=1)
     own = bounds[np.arange(n) // CHUNK].reshape(n, 3, 2, 3)
@@ -117,41 +111,33 @@ def read_compressed_ply(path: str | Path) -> Arrays:
 
     color = _unpack(words[:, 3], (8, 8, 8, 8))
     three = (_unpack(words[:, 1], _TURN_BITS) - 0.5) * 2 * SPREAD
-    with np.errstate(over="ignore", invalid="ignore"):
-        means = between(_unpack(words[:, 0], _BITS), 0).astype(np.float32)
-        scales = between(_unpack(words[:, 2], _BITS), 1).astype(np.float32)
-        sh0 = ((between(color[:, :3], 2) - 0.5) / SH_C0).astype(np.float32)
-    for name, values in (("positions", means), ("scales", scales), ("colours", sh0)):
-        if not np.isfinite(values).all():
-            raise ValueError(f"{path}: {name} out of the range of float32")
     return {
-        "means": means,
-        "scales": scales,
-        "quats": of_smallest_three(words[:, 1] >> np.uint32(sum(_TURN_BITS)), three).astype(np.float32),
+        "means": between(_unpack(words[:, 0], _BITS), 0),
+        "scales": between(_unpack(words[:, 2], _BITS), 1),
+        "quats": of_smallest_three(words[:, 1] >> np.uint32(sum(_TURN_BITS)), three),
         "opacities": to_logits(color[:, 3], 1 / 255),
-        "sh0": sh0[:, None],
-        "shN": _harmonics(path, elements.get("sh"), n),
+        "sh0": of_colors(between(color[:, :3], 2)),
+        "shN": _harmonics(elements.get("sh"), n),
+        **told,
     }
 
 
-def _harmonics(path: Path, rows: NDArray[Any] | None, n: int) -> NDArray[np.float32]:
+def _harmonics(rows: NDArray[Any] | None, n: int) -> NDArray[np.float64]:
     if rows is None:
-        return np.zeros((n, 0, 3), np.float32)
+        return np.zeros((n, 0, 3))
     names = [name for name in rows.dtype.names or () if name.startswith("f_rest_")]
     if len(names) not in _COUNTS or len(rows) != n:
-        raise ValueError(
-            f"{path}: {len(rows):,} rows of {len(names)} harmonics, wanted {n:,} of one of {_COUNTS}"
-        )
-    levels = _columns(path, rows, [f"f_rest_{k}" for k in range(len(names))], "u").astype(np.float64)
+        raise ValueError(f"{len(rows):,} rows of {len(names)} harmonics, wanted {n:,} of one of {_COUNTS}")
+    levels = _columns(rows, [f"f_rest_{k}" for k in range(len(names))], "u").astype(np.float64)
     values = ((levels + 0.5) / 256 - 0.5) * 8
-    return np.ascontiguousarray(values.reshape(n, 3, len(names) // 3).transpose(0, 2, 1).astype(np.float32))
+    return values.reshape(n, 3, len(names) // 3).transpose(0, 2, 1)
 
 
-def _columns(path: Path, rows: NDArray[Any], names: Any, kind: str) -> NDArray[Any]:
+def _columns(rows: NDArray[Any], names: Any, kind: str) -> NDArray[Any]:
     present = rows.dtype.names or ()
     missing = [name for name in names if name not in present or rows.dtype[name].kind != kind]
     if missing:
-        raise ValueError(f"{path}: these properties are missing or of another type: {', '.join(missing)}")
+        raise ValueError(f"these properties are missing or of another type: {', '.join(missing)}")
     return np.stack([rows[name] for name in names], axis=1) if names else np.zeros((len(rows), 0))
 
 

@@ -1,34 +1,61 @@
-"""Which format a file has."""
+"""The formats of scene files, and which one a file has: by what it holds, whatever its suffix says."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+import zipfile
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from hqgs.base.files import PLY
-from hqgs.model.formats.arrays import Arrays
-from hqgs.model.formats.compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
-from hqgs.model.formats.content import format_held
-from hqgs.model.formats.gltf import read_gltf, write_gltf
-from hqgs.model.formats.ksplat import read_ksplat
-from hqgs.model.formats.nerfstudio import in_data_frame
-from hqgs.model.formats.ply import read_ply, write_ply
-from hqgs.model.formats.sog import read_sog
-from hqgs.model.formats.sog_writer import write_sog
-from hqgs.model.formats.splat import read_splat, write_splat
-from hqgs.model.formats.spz import read_spz, write_spz
-from hqgs.model.formats.world_file import keep_world, read_world
+from hqgs.model.formats import gltf, ksplat, ply, sog, splat, spz
+from hqgs.model.formats.arrays import TENSORS, Arrays, Format
+from hqgs.model.formats.beside import in_data_frame, keep_world, read_world
+from hqgs.photos.files import DECODE_ERRORS
 from hqgs.scene.photo_files import is_run
 from hqgs.scene.world import World
 
+# By the ends of their files' names; where two fit, the longer counts.
+FORMATS: dict[str, Format] = {
+    name: row for module in (ply, spz, splat, gltf, sog, ksplat) for name, row in module.FORMATS.items()
+}
+WRITTEN = [name for name, row in FORMATS.items() if row.write is not None]
+DAMAGED = (
+    *DECODE_ERRORS,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+_PAGES = (b"<!doctype", b"<html", b"<?xml")
+_NOT = "not a scene file, but"
+
 
 def read_scene(path: Path, format: str) -> Arrays:
-    """What a scene file holds, with the frame that stands beside it, if one does."""
-    arrays = in_data_frame(path, FORMATS[format].read(path))
-    if "world" not in arrays and (world := read_world(path)) != World():
-        arrays["world"] = world
+    """What a scene file holds, float32, in the frame that it or a file beside it says.
+
+    Raises FileNotFoundError, or ValueError that names the file.
+    """
+    try:
+        arrays = in_data_frame(path, FORMATS[format].read(path))
+    except DAMAGED as error:
+        if isinstance(error, FileNotFoundError) and not path.exists():
+            raise
+        told = str(error)
+        if type(error) is not ValueError:
+            told = f"not a readable {FORMATS[format].of or format} file: {error!r:.200}"
+        raise ValueError(told if str(path.parent) in told else f"{path}: {told}") from error
+    for name in TENSORS:
+        with np.errstate(over="ignore"):
+            arrays[name] = np.ascontiguousarray(arrays[name], np.float32)
+        if not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{path}: {name} are not finite in float32")
+    if arrays.get("world", World()) == World():
+        arrays["world"] = read_world(path)
     return arrays
 
 
@@ -36,41 +63,12 @@ def write_scene(path: Path, arrays: Arrays, format: str) -> int:
     """Write a scene file, and its frame beside it where the format has no place for that."""
     write = FORMATS[format].write
     assert write is not None
-    left_out = write(path, arrays)
+    try:
+        left_out = write(path, arrays)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     keep_world(path, World() if FORMATS[format].world else arrays.get("world", World()))
     return left_out
-
-
-def _read_any_ply(path: Path) -> Arrays:
-    return read_compressed_ply(path) if is_compressed_ply(path) else read_ply(path)
-
-
-@dataclass(frozen=True)
-class Format:
-    """How scenes are read and written, and what such a file has a place for."""
-
-    read: Callable[[Path], Arrays]
-    write: Callable[[Path, Arrays], int] | None = None  # None: it is only read
-    of: str | None = None  # the format whose content it has, where that is another's
-    world: bool = False  # the frame of the scene
-    errors: bool = False  # what trust was learned
-    antialiased: bool = False  # that flag
-
-
-# By the ends of their files' names; where two fit, the longer counts.
-FORMATS = {
-    "ply": Format(_read_any_ply, write_ply, world=True, errors=True, antialiased=True),
-    "spz": Format(read_spz, lambda path, arrays: write_spz(path, arrays).left_out, antialiased=True),
-    "splat": Format(read_splat, write_splat),
-    "compressed.ply": Format(_read_any_ply, write_compressed_ply, of="ply"),
-    "glb": Format(read_gltf, write_gltf, world=True, errors=True),
-    "gltf": Format(read_gltf, world=True),
-    "full.ply": Format(_read_any_ply, partial(write_ply, full=True), of="ply", antialiased=True),
-    "sog": Format(read_sog, write_sog, antialiased=True),
-    "meta.json": Format(read_sog, of="sog"),
-    "ksplat": Format(read_ksplat),
-}
-WRITTEN = [name for name, format in FORMATS.items() if format.write is not None]
 
 
 def has_format(path: Path) -> bool:
@@ -95,8 +93,8 @@ def format_of(path: Path, name: str | None = None, *, written: bool = False) -> 
         if name not in known:
             raise ValueError(f"format is {name!r}, wanted one of: {', '.join(known)}")
         return name
-    if path.is_dir() and (path / "meta.json").is_file():
-        return "meta.json"
+    if path.is_dir() and (path / sog.META).is_file():
+        return sog.META
     fitting = _fitting(path, known)
     held = None if written or not path.is_file() else format_held(path)
     if held is not None and not any((FORMATS[format].of or format) == held for format in fitting):
@@ -106,6 +104,44 @@ def format_of(path: Path, name: str | None = None, *, written: bool = False) -> 
     return max(fitting, key=len)
 
 
+def format_held(path: Path) -> str | None:
+    """The format of a file by its first bytes; None: they tell none, as those of .splat.
+
+    ValueError for what people have in place of a scene file: nothing, a web page, a pointer, a packed file.
+    """
+    with path.open("rb") as file:
+        head = file.read(512)
+    if not head:
+        raise ValueError(f"{path}: {_NOT} empty: its download did not succeed")
+    if head.startswith(b"version https://git-lfs"):
+        raise ValueError(f"{path}: {_NOT} a pointer of Git LFS: `git lfs pull` fetches the file")
+    if head.lstrip().lower().startswith(_PAGES):
+        raise ValueError(f"{path}: {_NOT} a web page: download the file itself")
+    if head.startswith(b"\x1f\x8b"):
+        try:
+            head = zlib.decompressobj(spz.GZIP).decompress(head, 4)
+        except zlib.error:
+            return None
+        if head.startswith(b"ply"):
+            raise ValueError(f"{path}: {_NOT} one packed by gzip: unpack it")
+    if head.startswith(b"PK\3\4") and zipfile.is_zipfile(path):
+        return _of_zip(path)
+    return next((name for name, row in FORMATS.items() if row.starts and head.startswith(row.starts)), None)
+
+
+def _of_zip(path: Path) -> str | None:
+    try:
+        with zipfile.ZipFile(path) as packed:
+            names = [Path(name).name for name in packed.namelist()]
+    except (*DECODE_ERRORS, zipfile.BadZipFile):  # damaged; or of a version to come
+        return None
+    if "data.pkl" in names:
+        raise ValueError(f"{path}: {_NOT} a checkpoint of PyTorch: export the scene as .ply")
+    if sog.META not in names:
+        raise ValueError(f"{path}: {_NOT} an archive: unpack it")
+    return "sog"
+
+
 def scene_file(path: str | Path) -> Path:
     """The file itself, scene.ply of a run's folder, or meta.json of a SOG scene's that was unpacked.
 
@@ -113,8 +149,8 @@ def scene_file(path: str | Path) -> Path:
     """
     path = Path(path)
     file = path / PLY if path.is_dir() else path
-    if path.is_dir() and not file.is_file() and (path / "meta.json").is_file():
-        file = path / "meta.json"
+    if path.is_dir() and not file.is_file() and (path / sog.META).is_file():
+        file = path / sog.META
     if file.is_file():
         return file
     if is_run(path):

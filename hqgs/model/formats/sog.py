@@ -1,14 +1,19 @@
 """SOG, the format of PlayCanvas: each value of the Gaussians a pixel of a lossless WebP picture.
 
 A zip file, or the folder that it unpacks to: meta.json says which pictures there are, and what their bytes
-stand for. Version 2 has codebooks, version 1, which names none, the ends of each range. `sog_writer.py`
-writes version 2.
+stand for. Version 2, which is written, has codebooks, version 1, which names none, the ends of each range.
+
+What a value that was written and read back may differ by: means half of 1/65535 of the range of
+sign(x) log(1 + |x|) along each axis; opacities half of 1/255; rotations 0.02 rad. Scales and colours become
+the nearest of 256 values each, harmonics the nearest of up to 65,536 sets: k-means has no bound, and `hqgs
+export` measures what it changes.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,55 +23,114 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.model.formats.arrays import Arrays
-from hqgs.model.formats.rows import of_smallest_three, to_logits
-from hqgs.photos.files import DECODE_ERRORS
+from hqgs.base.files import atomic_path
+from hqgs.model.formats.arrays import (
+    Arrays,
+    Format,
+    of_smallest_three,
+    smallest_three,
+    to_logits,
+    to_opacities,
+    writable,
+)
+from hqgs.model.formats.codebooks import codebook, palette
 
 META = "meta.json"
 MOST_BYTES = 1 << 30  # of a picture in its file
 MOST_GAUSSIANS = 50_000_000
 ACROSS = 64  # centroids of harmonics in a row of their picture
-_COEFFICIENTS = (0, 3, 8, 15)  # by bands
 LARGEST = 252  # the alpha of a rotation whose w is its largest component, left out
+_COEFFICIENTS = (0, 3, 8, 15)  # by bands
+Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 
-def read_sog(path: str | Path) -> Arrays:
-    """Read a .sog file, or meta.json of one that was unpacked: float32 arrays.
+def write_sog(path: Path, arrays: Arrays) -> int:
+    """Write a .sog file atomically, without rows that hold NaN or Inf; return how many those were.
 
-    Raises FileNotFoundError, or ValueError that names the file.
+    The Gaussians get an order along a curve through space, which packs well.
     """
-    path = Path(path)
-    try:
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as packed:
-                inside = {Path(name).name: name for name in packed.namelist()}
+    g, left_out = writable(arrays, ".sog", curve=True)
+    files = encode_sog(g, bool(arrays.get("antialiased")))
+    with atomic_path(path) as tmp, zipfile.ZipFile(tmp, "w", zipfile.ZIP_STORED) as out:
+        for name, content in files.items():  # a fixed date: the same scene, the same bytes
+            out.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
+    return left_out
 
-                def member(name: str) -> bytes:
-                    info = packed.getinfo(inside[name])
-                    if info.file_size > MOST_BYTES:
-                        raise ValueError(f"{name} promises {info.file_size:,} bytes")
-                    return packed.read(info)
 
-                return _read(member)
-        if not path.name.lower().endswith(META):
-            raise ValueError("it is no zip file")
+def encode_sog(g: Arrays, antialiased: bool) -> dict[str, bytes]:
+    """The files of a scene by their names, of rows that are finite, in their order."""
+    n, coefficients = g["shN"].shape[:2]
+    means = g["means"].astype(np.float64)
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = (logs.min(0), logs.max(0)) if n else (np.zeros(3), np.zeros(3))
+    fixed = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.int64)
+    scales, colors = codebook(g["scales"]), codebook(g["sh0"][:, 0])
+    opacities = np.rint(255 * to_opacities(g["opacities"]))[:, None]
+    files = {
+        "means_l.webp": _webp(fixed % 256),
+        "means_u.webp": _webp(fixed // 256),
+        "scales.webp": _webp(scales[1]),
+        "quats.webp": _webp(_smallest_three(g["quats"].astype(np.float64))),
+        "sh0.webp": _webp(np.concatenate([colors[1], opacities], axis=1)),
+    }
+    meta: dict[str, Any] = {"version": 2, "count": n, "antialias": antialiased}
+    meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]}
+    meta["scales"] = {"codebook": scales[0].tolist(), "files": ["scales.webp"]}
+    meta["quats"] = {"files": ["quats.webp"]}
+    meta["sh0"] = {"codebook": colors[0].tolist(), "files": ["sh0.webp"]}
+    if coefficients and n:
+        wanted = min(1 << 16, -(-n // 4))  # a label has two bytes; four Gaussians share a set
+        sets, labels = palette(g["shN"].reshape(n, -1), 1 + opacities[:, 0], wanted)
+        book, codes = codebook(sets)
+        table = np.zeros((-(-len(sets) // ACROSS) * ACROSS, codes.shape[1]), np.uint8)
+        table[: len(sets)] = codes
+        files["shN_centroids.webp"] = _webp(table.reshape(-1, 3), ACROSS * coefficients)
+        files["shN_labels.webp"] = _webp(np.stack([labels % 256, labels // 256, 0 * labels], axis=1))
+        meta["shN"] = {"count": len(sets), "bands": _COEFFICIENTS.index(coefficients)}
+        meta["shN"]["codebook"] = book.tolist()
+        meta["shN"]["files"] = ["shN_centroids.webp", "shN_labels.webp"]
+    return {META: json.dumps(meta).encode()} | files
 
-        def beside(name: str) -> bytes:
-            return path.read_bytes() if name == META else (path.parent / name).read_bytes()
 
-        return _read(beside)
-    except (
-        *DECODE_ERRORS,
-        zipfile.BadZipFile,
-        LookupError,
-        TypeError,
-        ArithmeticError,
-        RuntimeError,  # zipfile's, of a newer version or a password; of JSON too deep
-    ) as error:
-        if isinstance(error, FileNotFoundError) and not path.exists():
-            raise
-        raise ValueError(f"{path}: not a readable SOG scene: {error!r:.200}") from error
+def _smallest_three(quats: Array) -> Array:
+    """Three components in 8 bits each, and in the fourth byte which one, the largest, is not among them."""
+    place, three = smallest_three(quats)
+    three = np.rint((three / np.sqrt(2) + 0.5) * 255)
+    return np.concatenate([three, LARGEST + place[:, None].astype(np.float64)], axis=1)
+
+
+def _webp(values: NDArray[Any], across: int = 0) -> bytes:
+    """Rows [N, 3 or 4] of bytes as the pixels of a picture, `across` in a row; 0: about square."""
+    width = across or 4 * math.ceil(len(values) ** 0.5 / 4) or 4
+    pixels = np.zeros((max(1, -(-len(values) // width)) * width, values.shape[1]), np.uint8)
+    pixels[: len(values)] = values
+    out = io.BytesIO()
+    picture = Image.fromarray(pixels.reshape(-1, width, values.shape[1]))
+    picture.save(out, "webp", lossless=True, exact=True, quality=50, method=4)
+    return out.getvalue()
+
+
+def read_sog(path: Path) -> Arrays:
+    """Read a .sog file, or meta.json of one that was unpacked. ValueError, or one of Pillow or zipfile."""
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as packed:
+            inside = {Path(name).name: name for name in packed.namelist()}
+
+            def member(name: str) -> bytes:
+                info = packed.getinfo(inside[name])
+                if info.file_size > MOST_BYTES:
+                    raise ValueError(f"{name} promises {info.file_size:,} bytes")
+                return packed.read(info)
+
+            return _read(member)
+    if not path.name.lower().endswith(META):
+        raise ValueError("not a readable SOG scene: it is no zip file")
+
+    def beside(name: str) -> bytes:
+        return path.read_bytes() if name == META else (path.parent / name).read_bytes()
+
+    return _read(beside)
 
 
 def _read(file: Callable[[str], bytes]) -> Arrays:
@@ -93,18 +157,15 @@ def _read(file: Callable[[str], bytes]) -> Arrays:
         opacities = to_logits(colors[:, 3] / 255, 1 / 255)
     else:
         together = _between(meta["sh0"], colors / 255)
-        sh0, opacities = together[:, :3], together[:, 3].astype(np.float32)
+        sh0, opacities = together[:, :3], together[:, 3]
     found: Arrays = {
-        "means": (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32),
-        "scales": _coded(meta["scales"], pixels(meta["scales"])[:, :3]).astype(np.float32),
-        "quats": _quats(pixels(meta["quats"])).astype(np.float32),
+        "means": (np.sign(logs) * np.expm1(np.abs(logs))),
+        "scales": _coded(meta["scales"], pixels(meta["scales"])[:, :3]),
+        "quats": _quats(pixels(meta["quats"])),
         "opacities": opacities,
-        "sh0": sh0[:, None].astype(np.float32),
-        "shN": _harmonics(meta.get("shN"), pixels, count).astype(np.float32),
+        "sh0": sh0[:, None],
+        "shN": _harmonics(meta.get("shN"), pixels, count),
     }
-    for name in ("means", "scales", "quats", "opacities", "sh0", "shN"):
-        if not np.isfinite(found[name]).all():
-            raise ValueError(f"{name} are not finite")
     if meta.get("antialias") is True:
         found["antialiased"] = True
     return found
@@ -145,3 +206,6 @@ def _harmonics(part: dict[str, Any] | None, pixels: Callable[..., Bytes], count:
     number = labels[:, 0].astype(np.int64) + 256 * labels[:, 1].astype(np.int64)
     table = centroids[:, : coefficients * ACROSS, :3].reshape(-1, coefficients, 3)
     return _coded(part, table)[number]
+
+
+FORMATS = {"sog": Format(read_sog, write_sog, antialiased=True), META: Format(read_sog, of="sog")}

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.machine import AT_ONCE
 from hqgs.model.constants import LEAST_SCALE
-from hqgs.model.formats.arrays import Arrays
+from hqgs.model.formats.arrays import Arrays, of_colors, shown
 from hqgs.scene.constants import ROUNDING
+from hqgs.scene.world import World, world_for
 
 Array = NDArray[np.float64]
 
@@ -40,6 +45,40 @@ def mapped(arrays: Arrays, linear: Array, shift: Array) -> Arrays:
         "scales": logs.astype(np.float32),
         "shN": turned_harmonics(arrays["shN"].astype(np.float64), rotation).astype(np.float32),
     }
+
+
+def placed(arrays: Arrays, by: Array, world: World) -> Arrays:
+    """Gaussians that are held in a world, mapped by [4, 4] in the frame of its files.
+
+    Their means are those of that frame, float64 (`near_origin` holds them again); shapes stay in the unit.
+    """
+    moved = mapped(arrays, by[:3, :3], np.zeros(3))
+    moved["means"] = world.unit * moved["means"] + by[:3, :3] @ world.shift + by[:3, 3]
+    return moved
+
+
+def near_origin(arrays: Arrays, world: World) -> Arrays:
+    """Gaussians with means of a file, held in its world's unit, and around their middle if that is far."""
+    finite = arrays["means"][np.isfinite(arrays["means"]).all(1)]
+    shift = world_for(finite, finite).shift if len(finite) else (0.0, 0.0, 0.0)
+    held = replace(world, shift=shift)
+    return {**arrays, "means": held.into(arrays["means"]), "world": held}
+
+
+def recolored(arrays: Arrays, curve: Callable[[Array], Array]) -> Arrays:
+    """Gaussians whose colour from each direction became curve(colour): harmonics that are nearest to that."""
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    functions = np.append(np.ones((64, 1)), basis(directions)[:, : arrays["shN"].shape[1]], axis=1)
+    back = np.linalg.pinv(functions)
+    sh0, shN = arrays["sh0"].astype(np.float64), arrays["shN"].astype(np.float64)
+    step = max(1, AT_ONCE // 64)
+    for rows in (slice(at, at + step) for at in range(0, len(sh0), step)):
+        coefficients = np.append(shown(sh0[rows])[:, None], shN[rows], axis=1)  # the first: a colour
+        colors = curve(np.maximum(functions @ coefficients, 0))
+        new = back @ colors
+        sh0[rows], shN[rows] = of_colors(new[:, 0]), new[:, 1:]
+    return {**arrays, "sh0": sh0, "shN": shN}
 
 
 def turned_harmonics(coefficients: Array, rotation: Array) -> Array:

@@ -167,6 +167,9 @@ class Viewer:
             middle = focus(cameras)
             self._reach = max(float(start.viewmat[2, :3] @ (middle - start.center)), 1e-6)
         else:
+            if gaussians.world.up is not None:
+                self._up = np.array(gaussians.world.up)
+                self._server.scene.set_up_direction(self._up)
             start = orbit(gaussians, 1, up=self._up)[0]
             middle = content(gaussians.means, gaussians.opacities)[0]
             self._reach = float(np.linalg.norm(start.center - middle))
@@ -334,7 +337,9 @@ class Viewer:
             self._tell("This scene has no folder to save it in.")
         else:
             path = self._folder / PATH_FILE
-            save_path(path, self._path(), world=None if self._gaussians is None else self._gaussians.world)
+            shown = self._gaussians
+            frame = {} if shown is None else {"world": shown.world, "by": shown.moved}
+            save_path(path, self._path(), **frame)
             command = ["hqgs", "render", str(self._source), "--path", str(path), "--out", "path.mp4"]
             self._tell(f"Saved. `{shlex.join(command)}`")
 

@@ -1,1 +1,0 @@
-"""Whether a viewer shows a scene right, and what is wrong where it does not."""
