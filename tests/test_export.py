@@ -23,8 +23,7 @@ from hqgs.model.render import render_view
 from hqgs.scene import source as scene_source
 from hqgs.scene.camera_files import load_cameras, save_cameras
 from hqgs.scene.scene import Camera
-from hqgs.show.export import along_a_curve, export, file_degree, needed_degrees, reduce_gaussians
-from hqgs.show.export_change import measure
+from hqgs.show.export import along_a_curve, export, file_degree, measure, needed_degrees, reduce_gaussians
 from hqgs.show.export_options import ExportOptions
 
 CAMERA = Camera(48, 32, np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), np.eye(4))
@@ -187,7 +186,7 @@ def test_no_gaussian_at_all(tmp_path: Path, name: str) -> None:
 
 def test_options_are_checked() -> None:
     for wrong, message in (
-        ({"format": "obj"}, "format is 'obj', wanted one of: ply, spz, splat, compressed.ply, glb"),
+        ({"format": "obj"}, "format is 'obj', wanted one of: ply, full.ply, compressed.ply, spz, splat, glb"),
         ({"sh_degree": 4}, "sh_degree is 4"),
         ({"band_tolerance": -0.1}, "band_tolerance is -0.1"),
         ({"band_tolerance": math.nan}, "band_tolerance is nan"),
@@ -274,7 +273,7 @@ def test_the_format_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
     [
         ("a.glb", True),
         ("a.splat", True),
-        ("a.compressed.ply", True),
+        ("a.compressed.ply", False),
         ("a.spz", False),
         ("a.sog", False),
         ("a.full.ply", False),

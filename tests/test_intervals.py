@@ -8,8 +8,8 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.scenes.sparse import ARC, HIGH, LOW, camera_on_arc
-from hqgs.evaluation.constants import CONFIDENCE, SPREAD_LOGS, SPREADS
-from hqgs.evaluation.intervals import difference, half_width, with_half
+from hqgs.evaluation.constants import CONFIDENCE
+from hqgs.evaluation.intervals import SPREAD_LOGS, SPREADS, difference, half_width, with_half
 from hqgs.evaluation.metrics import psnr
 from hqgs.scene.builtin.shading import render_view
 

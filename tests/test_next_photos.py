@@ -11,7 +11,7 @@ import pytest
 from hqgs.scene.next_photos import next_photos, told_next
 from hqgs.scene.paths import look_at
 from hqgs.scene.scene import Scene, SfmReport, View
-from hqgs.show.page.places import places_chart
+from hqgs.show.page.charts import places_chart
 
 UP = np.array([0.1, -1.0, 0.05]) / np.linalg.norm([0.1, -1.0, 0.05])
 

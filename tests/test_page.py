@@ -42,7 +42,6 @@ def test_a_run_has_its_page(run: hqgs.Run) -> None:
     assert text.partition("Where the photos were taken")[0].count("<circle") == 4 * len(run.history)
     assert text.count("data:image/jpeg;base64,") == 2 * len(run.views) + 3
     assert "Trust: on 1 held-out photo " in text
-    assert re.search(r"would have a PSNR of \d+\.\d ± \d+\.\d dB \(90% interval, by 1 held-out", text)
     assert '"max_gaussians": ' in text.replace("&#34;", '"')
     assert "does not look at them" in text  # 3dgs diagnoses nothing
 

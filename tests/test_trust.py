@@ -9,20 +9,27 @@ import numpy as np
 import plyfile
 import pytest
 import torch
-from scipy import stats
 from test_ply import random_gaussians
 from tiny_scene import tiny_scene
 
 import hqgs
 from hqgs.cli import main as cli
-from hqgs.evaluation.metrics import psnr
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import load_cameras, save_cameras
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.show.constants import EMPTY, FLOOR, GOOD, SHARE, SPREAD, SPREAD_PHOTOS
-from hqgs.show.trust import Held, Trust, _back, bound_of, calibrated, learn_trust
-from hqgs.show.trust_measured import _ause, measure_trust, predict_psnr
-from hqgs.show.trust_next import doubtful_spots
+from hqgs.show.trust import (
+    EMPTY,
+    FLOOR,
+    GOOD,
+    SHARE,
+    Held,
+    _ause,
+    _back,
+    bound_of,
+    calibrated,
+    learn_trust,
+    measure_trust,
+)
 
 
 def solid() -> Gaussians:
@@ -92,17 +99,18 @@ def test_what_a_mask_leaves_out_says_nothing_and_the_background_is_the_runs(tmp_
     save_cameras(tmp_path, shot, red)
     trust = learn_trust(g, load_cameras(tmp_path))
     assert [one.name for one in trust.held] == [view.name for view in scene.test]
-    assert trust.held[0].psnr > 28  # of a JPEG
+    assert trust.held[0].flat(trust.held[0].error).mean() < 0.03  # of a JPEG
     measured = measure_trust(trust)
     assert measured is not None
     assert measured.covered >= SHARE - 0.01
     save_cameras(tmp_path, shot)
-    assert learn_trust(g, load_cameras(tmp_path)).held[0].psnr < 20
+    black = learn_trust(g, load_cameras(tmp_path)).held[0]
+    assert black.flat(black.error).mean() > 0.08
 
 
-def held(error: np.ndarray, carried: np.ndarray, psnr: float = 25.0) -> Held:
+def held(error: np.ndarray, carried: np.ndarray) -> Held:
     one = np.ones_like(error)
-    return Held("a", tiny_scene().test[0].camera, psnr, error, carried, one, one, one > 0)
+    return Held("a", tiny_scene().test[0].camera, error, carried, one, one, one > 0)
 
 
 def test_the_factor_keeps_nine_of_ten_pixels_below_their_bound() -> None:
@@ -130,36 +138,6 @@ def test_the_factor_grows_until_what_is_called_good_is() -> None:
     assert (255 * error <= bound).mean() >= SHARE
     assert factor > max(float(np.quantile(some.needed(), SHARE)), 0.0)
     assert not good.any() or (255 * error <= GOOD)[good].mean() >= SHARE
-
-
-def test_psnr_of_a_path_by_hand() -> None:
-    """Photos that are all alike say their own PSNR, with the spread that is known before them."""
-    g, scene = solid(), tiny_scene()
-    carried = np.full((20, 30), 0.02, np.float32)
-    some = tuple(held(carried, carried, psnr) for psnr in (24.0, 25.0, 26.0))
-    trust = Trust(g, torch.full((len(g),), 0.02), torch.zeros(len(g)), 1.0, some)
-    cameras = [view.camera for view in scene.test]
-    found = predict_psnr(trust, cameras, [view.camera for view in scene.train])
-    assert found is not None
-    freedom = SPREAD_PHOTOS + 2
-    spread = np.sqrt((SPREAD_PHOTOS * SPREAD**2 + 2) / freedom)
-    off = found.mean - 25  # what the path shows less well than the held-out photos do, at a slope of 1
-    wanted = stats.t.ppf(0.95, freedom) * spread * np.sqrt(1 + 1 / 3 + off**2 / 5)
-    assert found.half_width == pytest.approx(wanted)
-    assert len(found.each) == len(cameras)
-    assert predict_psnr(Trust(g, trust.errors, trust.photos), cameras, cameras) is None
-
-
-def test_what_is_said_of_held_out_photos_is_so(tmp_path: Path) -> None:
-    g = solid()
-    scene = as_run(tmp_path, g, g.means[:, 0] > g.means[:, 0].median())
-    known = load_cameras(tmp_path)
-    trust = learn_trust(g, known)
-    found = predict_psnr(trust, known.test, known.train)
-    assert found is not None
-    true = [psnr(g.render(v.camera).numpy(), v.image) for v in scene.test]
-    assert np.mean([t for t in true if t is not None]) == pytest.approx(found.mean, abs=found.half_width)
-    assert found.half_width < 6
 
 
 def test_each_gaussian_gets_its_weights_in_the_pixels() -> None:
@@ -227,21 +205,6 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "has no cameras.json and photos/" in capsys.readouterr().err
 
 
-def test_a_path_is_rendered_with_what_photos_of_it_would_show(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    g = solid()
-    as_run(tmp_path, g, g.means[:, 0] > 0)
-    call = ["render", str(tmp_path), "--frames", "3", "--out", str(tmp_path / "frames")]
-    assert cli.main(call) == 0
-    told = capsys.readouterr().out
-    assert "photos from this path would differ from it by a PSNR of" in told
-    assert "90% interval, by 1 held-out photo)" in told
-    (tmp_path / "photos" / "00000.jpg").unlink()
-    assert cli.main(call) == 0
-    assert "would differ" not in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("name", ["a.ply", "a.glb", "a.full.ply", "a.spz", "a.sog", "a.splat"])
 def test_files_hold_it_or_say_that_they_do_not(
     tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
@@ -271,26 +234,6 @@ def test_files_hold_it_or_say_that_they_do_not(
         assert cli.main(["export", str(tmp_path / "with.ply"), "--out", str(tmp_path / name)]) == 0
         assert f"left out: trust of the Gaussians: a .{name[2:]} file" in capsys.readouterr().out
         assert Gaussians.load(tmp_path / name).errors is None
-
-
-def test_where_little_is_known_is_told(tmp_path: Path) -> None:
-    g = solid()
-    scene = as_run(tmp_path, g, g.means[:, 0] > 0)
-    photos = [view for view in load_cameras(tmp_path).views if not view.held_out]
-    trust = Trust(g, torch.full((len(g),), 0.001), torch.zeros(len(g)))
-    found = doubtful_spots(trust, photos)
-    assert found
-    for spot in found:
-        name = next(view.name for view in scene.train if f" {view.name}: " in spot.told)
-        camera = next(view.camera for view in scene.train if view.name == name)
-        x, y, z = camera.viewmat[:3, :3] @ (spot.at - camera.center)
-        assert z == pytest.approx(0, abs=1e-6)
-        side = {"left of": (-1, 0), "right of": (1, 0), "above": (0, -1), "below": (0, 1)}
-        wanted = next(direction for words, direction in side.items() if spot.told.startswith(words))
-        np.testing.assert_allclose(np.sign([x, y]) * (np.abs([x, y]) > 1e-6), wanted)
-    same = Trust(g, torch.full((len(g),), EMPTY), torch.zeros(len(g)))
-    assert doubtful_spots(same, photos) == []
-    assert doubtful_spots(trust, photos[:1]) == []
 
 
 def test_another_reader_finds_the_column(tmp_path: Path) -> None:

@@ -34,13 +34,11 @@ from hqgs.evaluation.records import read_report
 from hqgs.scene import source
 from hqgs.scene.camera_files import load_cameras, load_path
 from hqgs.scene.paths import with_size
-from hqgs.show.constants import MAX_MESSAGE
 from hqgs.show.frames import trust_picture
 from hqgs.show.trust import learn_trust
 from hqgs.show.viewer import guard
-from hqgs.show.viewer.guard import allowed, start_server
-from hqgs.show.viewer.pictures import Pose, beside, same_view
-from hqgs.show.viewer.splats import browser_splats
+from hqgs.show.viewer.guard import MAX_MESSAGE, allowed, start_server
+from hqgs.show.viewer.pictures import Pose, beside, browser_splats, same_view
 from hqgs.show.viewer.viewer import BROWSER, RASTERIZER, Viewer, _table
 
 

@@ -79,8 +79,7 @@ def run(args: ExportScene) -> int:
         from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
         from hqgs.evaluation.run_folder import RunFolder
         from hqgs.model.gaussians import Gaussians
-        from hqgs.show.export import export
-        from hqgs.show.export_change import measure
+        from hqgs.show.export import export, measure
 
         gaussians, run = Gaussians.load(source), RunFolder.open(args.source)
         scene = None if args.scene is None else _held_out_photos(run, args)

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
     from hqgs.scene.scene import Camera
     from hqgs.show.trust import Trust
-    from hqgs.show.trust_measured import Predicted
 
 PATHS = ("cameras", "orbit")
 FRAMES = 240
@@ -87,7 +86,6 @@ def run(options: Render) -> int:
         check_frames(cameras, out, fps, options.show)
         look = None if options.look is None else look_of(run.folder, options.look)
         trust = _trust(options, gaussians, run) if options.show == "trust" else None  # it may take minutes
-        predicted = None if options.views is not None else _predicted(run, gaussians, cameras, trust)
         started = time.perf_counter()
         render_frames(
             gaussians,
@@ -110,8 +108,6 @@ def run(options: Render) -> int:
     px = f"{kinds[0][0]} x {kinds[0][1]} px" if len(kinds) == 1 else "several sizes"
     many = f"{len(cameras)} frames" if len(cameras) > 1 else "1 frame"
     print(f"{out}: {many}, {px}, {len(gaussians)} Gaussians, {len(cameras) / seconds:.1f} frames/s")
-    if predicted is not None:
-        print(f"photos from this path would differ from it by a PSNR of {predicted}")
     return 0
 
 
@@ -179,8 +175,7 @@ def _cameras(
 
 def _trust(options: Render, gaussians: Gaussians, run: RunFolder) -> Trust:
     """What the photos of the run say; prints how right that is on held-out ones."""
-    from hqgs.show.trust import trust_of
-    from hqgs.show.trust_measured import measure_trust
+    from hqgs.show.trust import measure_trust, trust_of
 
     known = gaussians.along(run.cameras)
     if known is None and gaussians.errors is None:
@@ -195,22 +190,6 @@ def _trust(options: Render, gaussians: Gaussians, run: RunFolder) -> Trust:
     elif known is not None:
         print("trust: not calibrated, as the run held out no photo: bounds are those of other captures")
     return trust
-
-
-def _predicted(
-    run: RunFolder, gaussians: Gaussians, cameras: list[Camera], trust: Trust | None
-) -> Predicted | None:
-    """What photos from a path would show of a run that held some out; None of anything else."""
-    from hqgs.show.trust import trust_of
-    from hqgs.show.trust_measured import predict_psnr
-
-    known = gaussians.along(run.cameras)
-    if len(cameras) < 2 or known is None:
-        return None
-    kept = [view.held_out for view in known.views if view.photo is not None and view.photo.is_file()]
-    if len(set(kept)) < 2 or len(kept) < len(known.views):
-        return None
-    return predict_psnr(trust_of(gaussians, known) if trust is None else trust, cameras, known.train)
 
 
 def _file_name(number: int, view: str) -> str:

@@ -29,8 +29,7 @@ from hqgs.evaluation.verdict import judged_by, overdone, told, verdict
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.names import KEPT, is_room
 from hqgs.scene.options import LoadOptions, PhotoOptions
-from hqgs.show.constants import PORT
-from hqgs.show.viewer.guard import check
+from hqgs.show.viewer.guard import PORT, check
 from hqgs.training.config import TrainConfig, TrainOptions, longest_side
 from hqgs.training.settings import config_of_values, config_values, read_config, with_plan
 

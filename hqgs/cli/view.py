@@ -16,8 +16,7 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.scenes import heed_endings, tell_read
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.model.formats.files import scene_file
-from hqgs.show.constants import PORT
-from hqgs.show.viewer.guard import ELSEWHERE, check
+from hqgs.show.viewer.guard import ELSEWHERE, PORT, check
 
 if TYPE_CHECKING:
     from hqgs.scene.scene import Scene
@@ -56,7 +55,8 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
         heed_endings()
         gaussians, run = Gaussians.load(file), RunFolder.open(file)
         report, title = run.report, run.folder.resolve().name
-        viewer = Viewer(gaussians.along(run.cameras), run.folder, port=options.port, title=title, source=options.source)
+        cameras, source = gaussians.along(run.cameras), options.source
+        viewer = Viewer(cameras, run.folder, port=options.port, title=title, source=source)
     except BAD_INPUT as error:
         return fail(2, error)
     try:

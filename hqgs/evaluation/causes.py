@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 
 from hqgs.base.evenly import evenly
 from hqgs.diagnosis.noise import estimate_noise
-from hqgs.evaluation.constants import BEFORE, FINE, FOG, MOST_CAMERAS, PATCH
+from hqgs.evaluation.constants import FINE, FOG, MOST_CAMERAS, PATCH
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.metrics import color_factors
 from hqgs.model.gaussians import Gaussians
@@ -77,7 +77,9 @@ def pixel_maps(gaussians: Gaussians, camera: Camera, shown: torch.Tensor) -> Map
     column, row = pixels[inside].astype(int).T
     before = torch.zeros(len(gaussians))
     before[torch.from_numpy(inside)] = torch.from_numpy(z[inside]).float() / depths[0, row, column, 0]
-    hangs = torch.from_numpy(inside) & (before < BEFORE)
+    hangs = torch.from_numpy(inside) & (
+        before < 0.75
+    )  # of the depth in its pixel: such a Gaussian hangs before the surface
     channels = torch.stack([hangs.float(), shown], 1).to(gaussians.means.dtype)
     found, solid = gaussians.rasterize(camera, channels)[0][0], alphas[0, ..., 0].clamp(min=1e-6)
     return Maps(found[..., 0].double().numpy(), (found[..., 1] / solid).double().numpy())

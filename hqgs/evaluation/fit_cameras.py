@@ -18,7 +18,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hqgs.base.threads import one_torch_thread
-from hqgs.evaluation.constants import DIFFERENCE, FIT_STEPS, SETTLED, SMOOTHED
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.photos.pixels import as_floats
@@ -26,6 +25,11 @@ from hqgs.scene.geometry import project, within
 from hqgs.scene.scene import Camera, View
 
 Floats = NDArray[np.float64]
+# Levenberg's steps: cameras turned by 1.5 degrees come home (`tests/test_fit_cameras.py`).
+SMOOTHED = (3.0, 1.0, 0.0)  # px; coarse to fine, so that a camera may be several pixels off
+FIT_STEPS = 10  # at each of them, at most
+DIFFERENCE = 0.3  # px by which a camera is moved to see what that changes
+SETTLED = 1e-4  # of the squared error; less gained ends a level
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from hqgs._rust import get_num_threads
 from hqgs.base.machine import give_back_memory, peak_rss_mb
 from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.threads import one_torch_thread
-from hqgs.evaluation.constants import KEPT_BYTES
 from hqgs.evaluation.metrics import ViewMetrics, evaluate_view, psnr, ssim
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
@@ -24,6 +23,8 @@ from hqgs.model.render import render_view
 from hqgs.photos.look import Look
 from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.scene import Scene, View
+
+KEPT_BYTES = 256e6  # of renders that are held; 12 of 1600 x 1067 px
 
 
 @dataclass(frozen=True)

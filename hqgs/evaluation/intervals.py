@@ -14,7 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hqgs.evaluation.constants import CONFIDENCE, SPREAD_LOGS, SPREADS
+from hqgs.evaluation.constants import CONFIDENCE
+
+# The deviation of photos' values within a scene, its median over nine captures, and the deviation of its log
+# between them: what a few photos that happen to agree are held against.
+SPREADS = {"psnr": 2.0, "psnr_aligned": 2.0, "ssim": 0.025, "haarpsi": 0.04}
+SPREAD_LOGS = 0.7
 
 
 def half_width(values: Sequence[float | None], metric: str | None = None) -> float | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hqgs.base.text import markdown_table
-from hqgs.evaluation.constants import FINE, FOG, LEAST, WORST
+from hqgs.evaluation.constants import FINE, FOG
 from hqgs.evaluation.intervals import with_half
 from hqgs.evaluation.verdict import verdict
 from hqgs.scene.constants import ENOUGH_SHOW
@@ -137,14 +137,14 @@ def scene_words(one: dict[str, Any]) -> str:
 def cause_words(causes: dict[str, float]) -> str:
     """The parts of the error, the largest first."""
     parts = sorted(causes.items(), key=lambda item: -item[1])
-    return ", ".join(f"{CAUSES[name][0]} {share:.0%}" for name, share in parts if share >= LEAST)
+    return ", ".join(f"{CAUSES[name][0]} {share:.0%}" for name, share in parts if share >= 0.005)
 
 
 def worst(one: dict[str, Any]) -> list[str]:
     """The photos with the lowest PSNR, and what it comes from there."""
     known = [(view["psnr"], name, view["causes"]) for name, view in one["views"].items() if view["psnr"]]
     lines = []
-    for psnr, name, causes in sorted(known, key=lambda item: item[:2])[:WORST]:
+    for psnr, name, causes in sorted(known, key=lambda item: item[:2])[:3]:
         parts = {part: causes[part] / causes["mse"] for part in CAUSES}
         lines.append(f"  {name}: {psnr:.2f} dB; {cause_words(parts)}")
     return ["worst photos:", *lines] if len(known) > 1 else []

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from hqgs.base.evenly import evenly
 from hqgs.base.files import REPORT
-from hqgs.evaluation.constants import AMPLIFICATION, CAPTION, SHEET_PHOTOS, TILE_SIDE
+from hqgs.evaluation.constants import AMPLIFICATION, SHEET_PHOTOS, TILE_SIDE
 from hqgs.evaluation.records import LearnedRecord, read_report
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.photos.look import Look
@@ -84,18 +84,18 @@ def learned_picture(
 
 
 def _tile(photo: NDArray[np.uint8] | NDArray[np.float32], record: LearnedRecord) -> Image.Image:
-    picture = Image.fromarray(to_uint8(as_floats(photo)))
+    picture, caption = Image.fromarray(to_uint8(as_floats(photo))), 18  # px
     scale = TILE_SIDE / max(picture.size)
     picture = picture.resize((max(round(picture.width * scale), 1), max(round(picture.height * scale), 1)))
-    tile = Image.new("RGB", (picture.width, picture.height + CAPTION), "white")
-    tile.paste(picture, (0, CAPTION))
+    tile = Image.new("RGB", (picture.width, picture.height + caption), "white")
+    tile.paste(picture, (0, caption))
     draw = ImageDraw.Draw(tile)
     stops = float(np.log2(record["gains"]).mean())
     facts = [f"{record['shake_px']:.1f} px" if record["shake_px"] else "still"]
     facts += [f"focus {record['defocus_px']:.1f} px"] if record["defocus_px"] else []
     facts += [f"{stops:+.2f} stops"] if np.ptp(record["gains"]) or stops else []
     draw.text((2, 3), f"{Path(record['name']).stem[-16:]}  {', '.join(facts)}", fill=(25, 25, 25))
-    middle = np.array([picture.width / 2, CAPTION + picture.height / 2])
+    middle = np.array([picture.width / 2, caption + picture.height / 2])
     scale *= AMPLIFICATION
     trajectory = [tuple(middle + scale * np.array(point)) for point in record["trajectory_px"]]
     if record["defocus_px"]:

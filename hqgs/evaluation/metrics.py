@@ -15,6 +15,8 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import math
+import sys
+import threading
 import warnings
 from dataclasses import dataclass, field, fields
 from functools import cache
@@ -27,7 +29,10 @@ from numpy.typing import NDArray
 
 from hqgs import _rust
 from hqgs.base.threads import one_torch_thread
-from hqgs.evaluation.constants import HAARPSI_MIN_SIZE, LPIPS_MIN_SIZE
+
+HAARPSI_MIN_SIZE = 16  # px: the coarsest Haar filter
+LPIPS_MIN_SIZE = 63  # px: AlexNet's smallest input
+_IMPORTING = threading.Lock()
 
 # The files that torchvision keeps its ImageNet weights in; the name ends in the start of the file's SHA-256.
 LPIPS_BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
@@ -107,9 +112,21 @@ def haarpsi(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] |
     if torch.equal(x, y):
         return 1.0  # the limit; the formula divides 0 by 0 for two black images
     with one_torch_thread(), torch.no_grad():
-        from piq import haarpsi as measure  # takes seconds and 200 MB to import
+        return float(_piq_haarpsi()(x, y, data_range=1.0))
 
-        return float(measure(x, y, data_range=1.0))
+
+@cache
+def _piq_haarpsi() -> Any:
+    """piq's function without the rest of piq, which imports torchvision: that takes seconds and 200 MB."""
+    with _IMPORTING:
+        given, spec = sys.modules.get("piq"), importlib.util.find_spec("piq")
+        assert spec is not None
+        sys.modules["piq"] = given or importlib.util.module_from_spec(spec)  # not executed: a folder alone
+        try:
+            return importlib.import_module("piq.haarpsi").haarpsi
+        finally:
+            if given is None:
+                del sys.modules["piq"]
 
 
 def lpips(

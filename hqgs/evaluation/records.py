@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from typing_extensions import NotRequired  # typing has it from Python 3.11 on
 
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
+# Objects of which another class says what they hold, the values that are known: a photo that was looked at
+# (`photo_record`), what was learned of a camera (`learned_record`), what was not finite and its events
+# (`Guard`), a process (`Ranks.record`), a decision (`PlanRow`), the frame (`World`, but for its place).
+PhotoRecord: TypeAlias = dict[str, Any]
+LearnedRecord = RankRecord = PlanRowRecord = WorldRecord = GuardEvent = GuardRecord = PhotoRecord
 
 
 class HistoryEntry(TypedDict):
@@ -65,82 +70,6 @@ class MetricsRecord(TypedDict):
     confidence: float  # of the intervals
     views: list[ViewMetricValues]
     reasons: dict[str, str]  # metric -> why the mean is None
-
-
-class GuardEvent(TypedDict):
-    """Something that was not finite. `gaussians` are row numbers at that iteration."""
-
-    iteration: int
-    view: str  # the training view of the step
-    what: str  # "photo", "loss", "gradient" or "parameter"
-    tensors: list[str]  # where it was found: "render", "means", ...; empty for a photo or the loss
-    count: int  # pixels' values of a photo, Gaussians elsewhere; 0 where no Gaussian is at fault
-    gaussians: list[int]
-
-
-class GuardRecord(TypedDict):
-    """What was not finite in a run."""
-
-    skipped_steps: int
-    culled_gaussians: int
-    num_events: int
-    events: list[GuardEvent]  # the first ones
-
-
-class PhotoRecord(TypedDict):
-    """What a training photo was found to suffer from, `PhotoDiagnosis` in short. None: not told from it."""
-
-    name: str
-    width: int
-    height: int
-    blur: str | None  # beyond a sharp photo's own: gaussian, defocus or motion, and how much of it
-    blur_px: float | None  # sigma, radius or length
-    noise: float | None  # levels of 1/255
-    jpeg_quality: int | None  # None: no JPEG was seen
-    enlarged: int  # 1: it was not
-
-
-class LearnedRecord(TypedDict):
-    """What was learned of a training photo's camera."""
-
-    name: str
-    shake_px: float  # how far the picture's middle went during the exposure
-    trajectory_px: list[list[float]]  # its trajectory, [9, 2], x to the right and y down; of mean 0
-    defocus_px: float  # radius of the largest disc that a point becomes
-    focus: float | None  # where, 1 at the photo's median depth; None: sharp, or out of focus as a whole
-    gains: list[float]  # of red, green and blue in linear light; their logarithms' mean over photos is 0
-    vignetting: NotRequired[list[float]]  # [2], as `hqgs.photos.look` has it; older runs do not tell
-    response: NotRequired[list[list[float]]]  # [2, 3]
-
-
-class RankRecord(TypedDict):
-    """One process of a run that several have trained."""
-
-    rank: int
-    view_seconds: float  # on its share of the views: renders, gradients, and sending them meanwhile
-    waiting_seconds: float  # for the others
-    sent_bytes: int
-
-
-class PlanRowRecord(TypedDict):
-    """One decision of a run; what is not there does not apply."""
-
-    what: str
-    value: str
-    why: str
-    evidence: NotRequired[str]  # what was measured
-    rule: NotRequired[str]  # the rule's name and its source
-    iteration: NotRequired[int]  # after which it was decided; none: before the first step
-
-
-class WorldRecord(TypedDict):
-    """The frame of what the run wrote: `World`, but for its place."""
-
-    unit: float  # of coordinates in memory, in those that were written
-    shift: list[float]
-    metres: float | None  # a written unit is a metre, and one of the files that were read this many
-    error: NotRequired[float]  # of metres, half of the 95 % interval, as a share
-    up: NotRequired[list[float]]
 
 
 class RunRecord(TypedDict):

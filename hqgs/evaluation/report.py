@@ -17,7 +17,7 @@ from PIL import Image
 
 from hqgs.base.files import PICTURES, REPORT, write_json
 from hqgs.base.machine import machine_facts, version_facts
-from hqgs.evaluation.constants import AMPLIFICATION, CONFIDENCE, MASKED, PNG_LEVEL
+from hqgs.evaluation.constants import AMPLIFICATION, CONFIDENCE, MASKED
 from hqgs.evaluation.held_out import RenderedView, measured, names_of
 from hqgs.evaluation.intervals import half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
@@ -77,7 +77,7 @@ def _written(out_dir: Path, result: RunResult) -> Report:
         (stage / PICTURES).mkdir()
 
         def draw(number: int, view: RenderedView, metrics: ViewMetrics) -> None:
-            comparison_picture(view, metrics).save(stage / PICTURES / files[number], compress_level=PNG_LEVEL)
+            comparison_picture(view, metrics).save(stage / PICTURES / files[number], compress_level=2)
 
         report = _report(result, measured(result.views, draw), files)
         write_json(stage / REPORT, report)

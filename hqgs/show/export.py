@@ -4,7 +4,7 @@ A Gaussian is left out where no pixel can show it. It loses its highest SH bands
 colour that it adds to a pixel by more than a tolerance, and the file loses a band that (next to) no Gaussian
 uses. The bound: by Unsöld's theorem the functions of degree l have the norm sqrt((2 l + 1) / (4 pi)) in every
 direction, so the band adds at most that times the norm of its coefficients to a channel, in any view; the
-Gaussian's opacity bounds its weight in a pixel.
+Gaussian's opacity bounds its weight in a pixel. Renders of what was written, read back, tell what it changed.
 """
 
 from __future__ import annotations
@@ -18,15 +18,22 @@ import torch
 from torch import Tensor
 
 from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
+from hqgs.base.evenly import evenly
 from hqgs.base.left_out import LeftOut
 from hqgs.model.formats.arrays import curve_order
 from hqgs.model.formats.beside import keep_world
 from hqgs.model.formats.files import FORMATS
-from hqgs.model.formats.sog import encode_sog
 from hqgs.model.formats.spz import encode_spz, write_spz
 from hqgs.model.gaussians import Gaussians
-from hqgs.show.constants import BAND_SHARE
+from hqgs.model.orbit import orbit
+from hqgs.scene.camera_files import RunCameras
+from hqgs.scene.constants import KEPT_SIDE
+from hqgs.scene.geometry import shrunk_camera
+from hqgs.scene.scene import Camera
 from hqgs.show.export_options import ExportOptions
+
+BAND_SHARE = 1e-3  # of the Gaussians: a band that no more of them use is left out for all
+VIEWS = 4  # renders that tell what a file changes, as large as photos beside cameras.json
 
 
 @dataclass(frozen=True)
@@ -51,17 +58,10 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
     path = Path(path)
     steps = reduce_gaussians(gaussians, options)
     reduced = steps[-1].gaussians if steps else gaussians
-    clipped: dict[str, int] = {}
-    if options.format != "spz":
-        reduced.save(path, options.format)
-    else:
-        arrays = along_a_curve(reduced).arrays()
-        clipped = write_spz(path, arrays, options.sh_bits, options.spz_version).clipped
-        keep_world(path, reduced.world)
-    written = path.stat().st_size
+    clipped = _write(reduced, path, options)
+    written, left_out = path.stat().st_size, list[LeftOut]()
     sizes = [_size(g, options) for g in (gaussians, *(step.gaussians for step in steps[:-1])) if steps]
-    sizes.append(written if options.format == "spz" else _size(reduced, options))
-    left_out = []
+    sizes.append(_size(reduced, options) if FORMATS[options.format].size else written)
     for step, (before, after) in zip(steps, pairwise(sizes), strict=True):
         saved = None if before is None or after is None else before - after
         left_out.append(LeftOut(step.what, step.why, step.evidence, bytes=saved))
@@ -99,14 +99,14 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Reduc
     g = steps[-1].gaussians if steps else g
 
     degrees = needed_degrees(g, options.band_tolerance)
-    most = min(options.sh_degree, g.sh_degree) if options.format != "splat" else 0
+    most = min(options.sh_degree, g.sh_degree) if FORMATS[options.format].harmonics else 0
     degree = file_degree(degrees, most)
     if degree < g.sh_degree:
         cut = int((degrees > degree).sum())
         asked = degree == options.sh_degree
         why = (
-            "a .splat file holds none"
-            if options.format == "splat"
+            f"a .{options.format} file holds none"
+            if not FORMATS[options.format].harmonics
             else "--sh-degree asks for it"
             if asked
             else f"at most 1 in {1 / BAND_SHARE:,.0f} Gaussians needs them"
@@ -166,20 +166,78 @@ def _without_bands(gaussians: Gaussians, degrees: Tensor) -> Gaussians:
     return gaussians.like(gaussians.named() | {"shN": gaussians.shN * keep[:, :, None]})
 
 
+def _write(gaussians: Gaussians, path: Path, options: ExportOptions) -> dict[str, int]:
+    """Write them as they are; how many values SPZ has no place for, by name."""
+    if options.format != "spz":
+        gaussians.save(path, options.format)
+        return {}
+    arrays = along_a_curve(gaussians).arrays()
+    clipped = write_spz(path, arrays, options.sh_bits, options.spz_version).clipped
+    keep_world(path, gaussians.world)
+    return clipped
+
+
 def _size(gaussians: Gaussians, options: ExportOptions) -> int | None:
-    """Bytes of the file without the text of a header; None where SPZ cannot hold them."""
-    n, higher = len(gaussians), 3 * gaussians.shN.shape[1]
-    if options.format in ("ply", "glb"):
-        return 4 * n * (3 + 3 + higher + 1 + 3 + 4 + (gaussians.errors is not None))
-    if options.format == "full.ply":
-        return 4 * n * 62
-    if options.format == "splat":
-        return 32 * n
-    if options.format == "compressed.ply":
-        return n * (16 + higher) + -(-n // 256) * 72
-    if options.format == "sog":
-        return sum(map(len, encode_sog(along_a_curve(gaussians).arrays(), gaussians.antialiased).values()))
+    """Bytes of the file without a header; None where SPZ cannot hold them, or SOG would take minutes."""
+    if size := FORMATS[options.format].size:
+        return size(len(gaussians), 3 * gaussians.shN.shape[1], gaussians.errors is not None)
+    if options.format != "spz":
+        return None
     try:
         return len(encode_spz(along_a_curve(gaussians).arrays(), options.sh_bits, options.spz_version).data)
     except ValueError:
         return None
+
+
+@dataclass(frozen=True)
+class Change:
+    """Between two scenes in the same cameras; levels are those of pictures with 8 bits, from 0 to 255."""
+
+    cameras: str  # which those were
+    psnr: float  # dB, over all pixels of all of them; inf where none changes
+    mean: float  # levels, absolute
+    worst: float  # levels, of one channel of one pixel
+    where: tuple[str, int, int]  # the camera, row and column of that pixel
+
+    def __str__(self) -> str:
+        if not self.worst:
+            return f"no pixel of {self.cameras} changes"
+        camera, row, column = self.where
+        return (
+            f"{self.cameras} change by {self.mean:.2f} levels of 255 in the mean ({self.psnr:.1f} dB), by "
+            f"{self.worst:.0f} at the worst pixel (row {row}, column {column} of {camera})"
+        )
+
+
+def measure(before: Gaussians, after: Gaussians, known: RunCameras | None) -> Change:
+    """Renders of both by a few cameras of a run, held-out ones where there are some.
+
+    Without any by some around the scene. ValueError for a scene of which nothing can be seen.
+    """
+    said, cameras = _cameras(before, known)
+    after = after.in_world(before.world)
+    squares, total, count, worst = 0.0, 0.0, 0, (0.0, ("", 0, 0))
+    with torch.no_grad():
+        for name, camera in cameras:
+            pictures = [255 * g.render(camera).clamp(0, 1).double() for g in (before, after)]
+            away = (pictures[0] - pictures[1]).abs()
+            squares += float(away.square().sum())
+            total += float(away.sum())
+            count += away.numel()
+            at = int(away.amax(-1).argmax())
+            worst = max(worst, (float(away.max()), (name, at // camera.width, at % camera.width)))
+    psnr = 10 * math.log10(255**2 * count / squares) if squares else math.inf
+    return Change(said, psnr, total / count, *worst)
+
+
+def _cameras(gaussians: Gaussians, known: RunCameras | None) -> tuple[str, list[tuple[str, Camera]]]:
+    if known is not None:
+        views = known.views
+        kind = "held-out views" if any(view.held_out for view in views) else "training views"
+        views = [view for view in views if view.held_out] or views
+        chosen = [views[k] for k in evenly(len(views), VIEWS)]
+        cameras = [(view.name, shrunk_camera(view.camera, KEPT_SIDE)) for view in chosen]
+        return f"renders of {len(chosen)} {kind}", cameras
+    return f"renders of {VIEWS} cameras around the scene", [
+        (f"camera {k + 1}", camera) for k, camera in enumerate(orbit(gaussians, VIEWS))
+    ]

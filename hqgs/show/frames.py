@@ -29,8 +29,7 @@ from hqgs.photos.video import FPS, pyav
 from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.names import FILM_SUFFIXES
 from hqgs.scene.scene import Camera
-from hqgs.show.constants import DEPTH_PERCENTILES, DEPTH_SAMPLES, THICKNESS_OF, WORST_SHOWN
-from hqgs.show.trust import Trust
+from hqgs.show.trust import WORST_SHOWN, Trust
 
 SHOWN = ("color", "depth", "alpha", "trust")
 FILMS = (".mp4", ".gif")
@@ -150,7 +149,7 @@ def frames(
     elif show == "alpha":
         yield from (grey(prepared.depth(camera)[1]) for camera in cameras)
     else:
-        places = evenly(len(cameras), DEPTH_SAMPLES)
+        places = evenly(len(cameras), 8)
         low_high = depth_range([prepared.depth(cameras[k]) for k in places])
         yield from (depth_picture(*prepared.depth(camera), low_high) for camera in cameras)
 
@@ -212,10 +211,10 @@ class Activated:
 
     @torch.no_grad()
     def thickness(self, at: NDArray[np.float64], ahead: NDArray[np.float64]) -> float:
-        """Standard deviation along a direction, unit [3], of the Gaussians around a point [3]: the median."""
+        """Median standard deviation along a direction, unit [3], of eight Gaussians around a point [3]."""
         means, quats, scales, _ = self._tensors
         apart = (means - torch.from_numpy(at).to(means)).square().sum(1)
-        rows = apart.topk(min(THICKNESS_OF, len(means)), largest=False).indices
+        rows = apart.topk(min(8, len(means)), largest=False).indices
         own = ahead @ matrices(quats[rows].double().numpy())  # along the Gaussians' axes
         return float(np.median(np.linalg.norm(own * scales[rows].numpy(), axis=1)))
 
@@ -225,7 +224,7 @@ def depth_range(samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]
     seen = np.concatenate([depth[alpha > 0.5] for depth, alpha in samples])
     if not seen.size:
         return 1.0, 2.0
-    low, high = (max(float(value), 1e-6) for value in np.percentile(seen, DEPTH_PERCENTILES))
+    low, high = (max(float(value), 1e-6) for value in np.percentile(seen, (2, 98)))
     return low, max(high, low * 1.001)
 
 

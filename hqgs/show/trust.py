@@ -10,9 +10,8 @@ the photos that it held out (`calibrated`): scenes learn their training photos b
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -26,24 +25,18 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import KnownCamera, RunCameras
 from hqgs.scene.geometry import resized_camera
 from hqgs.scene.scene import Camera
-from hqgs.show.constants import (
-    CALIBRATORS,
-    EMPTY,
-    FLOOR,
-    GOOD,
-    LEAST_GOOD,
-    NONE_GOOD,
-    POWER,
-    PRIOR,
-    SCALE,
-    SEEN,
-    SHARE,
-    TRUST_PHOTOS,
-    TRUST_ROUNDS,
-    TRUST_SIDE,
-    TRUST_TRAINED,
-)
 
+WORST_SHOWN = 64.0  # levels of 255, of the brightest or reddest pixel of a map of errors
+PHOTOS, SIDE = 64, 400  # training photos that are looked at, at most; px, of their longer side
+ROUNDS = 4  # of the maximisation: more change the order of the pixels by less than its scatter
+PRIOR = 0.1  # error of a Gaussian (white is 1), as of one pixel's weight
+EMPTY = 0.3  # error of what is behind everything
+FLOOR = 0.002  # keeps ratios of errors finite: half a level
+POWER, SCALE = 0.70, 0.52  # from what is carried to what SHARE of new pixels stay below: of three scenes
+SHARE = 0.9  # of the pixels: what a bound promises
+GOOD, LEAST_GOOD = 20.0, 0.005  # levels of 255: a pixel with such a bound is good; share of them that tells
+NONE_GOOD = 1.00001  # of the factor at which the surest pixel is still called good: none is
+CALIBRATORS = 40  # held-out photos that calibrate, at most
 Array = NDArray[np.float32]
 
 
@@ -53,7 +46,6 @@ class Held:
 
     name: str
     camera: Camera
-    psnr: float  # dB, at the size that it was kept in
     error: Array  # mean of the channels, white is 1
     carried: Array  # before calibration
     alpha: Array
@@ -86,21 +78,22 @@ class Trust:
     photos: Tensor  # [N], how many see it; 0 where a file says the errors
     factor: float = 1.0  # by which the errors were calibrated
     held: tuple[Held, ...] = ()  # what calibrated them
-    trained: tuple[Held, ...] = ()  # the same of a few training photos
 
     def bound(self, camera: Camera) -> Array:
         """Levels of 255 that a pixel's error, the mean of its channels, stays below 9 times of 10, [H, W].
 
         Of photos that are blurred or noisy, it is the distance from such photos.
         """
-        return bound_of(*self.shown(camera, self.errors))
+        (carried,), alpha = blended(self.gaussians, camera, self.errors)
+        return bound_of(carried, alpha)
 
-    def shown(self, camera: Camera, values: Tensor) -> tuple[Array, Array]:
-        """Values of the Gaussians, [N], blended as colours are, and alpha, both [H, W]."""
-        with one_torch_thread(), torch.no_grad():
-            near = self.gaussians.near_plane()
-            carried, alpha, _ = self.gaussians.rasterize(camera, values[:, None], near_plane=near)
-        return carried[0, ..., 0].numpy(), alpha[0, ..., 0].numpy()
+
+def blended(gaussians: Gaussians, camera: Camera, *values: Tensor) -> tuple[list[Array], Array]:
+    """Values of the Gaussians, [N] each, blended as colours are, and alpha, all [H, W]."""
+    with one_torch_thread(), torch.no_grad():
+        near = gaussians.near_plane()
+        pictures, alpha, _ = gaussians.rasterize(camera, torch.stack(values, -1), near_plane=near)
+    return [*pictures[0].permute(2, 0, 1).contiguous().numpy()], alpha[0, ..., 0].numpy()
 
 
 def bound_of(carried: Array, alpha: Array) -> Array:
@@ -159,46 +152,43 @@ def trust_of(gaussians: Gaussians, known: RunCameras | None) -> Trust:
     return learn_trust(gaussians, known or RunCameras(np.zeros(3), []))
 
 
-def learn_trust(gaussians: Gaussians, known: RunCameras, photos: int = TRUST_PHOTOS) -> Trust:
+def learn_trust(
+    gaussians: Gaussians, known: RunCameras, photos: int = PHOTOS, held_out: int = CALIBRATORS
+) -> Trust:
     """What the photos of a run, in its folder, say of its Gaussians.
 
-    The errors are those of at most `photos` training photos, the factor is that of the held-out ones.
+    The errors are those of at most `photos` training photos, the factor is that of `held_out` others.
     ValueError where the run has no training photo.
     """
     views = [view for view in known.views if not view.held_out and shows(view)]
     if not views:
         raise ValueError("trust needs the photos of a run: give its folder, with cameras.json and photos/")
-    chosen, n = [views[k] for k in evenly(len(views), photos)], len(gaussians)
-    looks = list[Off]()
+    n = len(gaussians)
     sums, seen = torch.zeros(n, 2), torch.zeros(n)  # sums of weights, and of weights times errors
-
     with one_torch_thread():
-        for view in chosen:
-            off = error_of(gaussians, view, known.background)
-            looks.append(off)
+        looks = [error_of(gaussians, views[k], known.background) for k in evenly(len(views), photos)]
+        for off in looks:
             pixels = torch.stack([off.counts.float(), off.error], -1)
             both = _back(gaussians, off.camera, torch.zeros(n, 2), pixels)
             sums += both
-            seen += both[:, 0] > SEEN
+            seen += both[:, 0] > 0.5  # pixels' weight, of a Gaussian that a photo sees
         weights = sums[:, 0] + 1
         errors = (sums[:, 1] + PRIOR) / weights
-        for _ in range(TRUST_ROUNDS):
+        for _ in range(ROUNDS):
             found = torch.zeros(n)
             for off in looks:
                 found += _back(gaussians, off.camera, errors[:, None], off.error[..., None], off.counts)[:, 0]
             errors = (errors * found + PRIOR) / weights
-    carried = Trust(gaussians, errors, seen)
-
-    def look(view: KnownCamera) -> Held:
-        off = error_of(gaussians, view, known.background, psnr=True)
-        shown = *carried.shown(off.camera, errors), carried.shown(off.camera, seen)[0]
-        return Held(view.name, off.camera, off.psnr, off.error.numpy(), *shown, off.counts.numpy())
-
-    out = [view for view in known.views if view.held_out and shows(view)]
-    held = tuple(one for k in evenly(len(out), CALIBRATORS) if (one := look(out[k])).counts.any())
-    trained = tuple(look(chosen[k]) for k in evenly(len(chosen), TRUST_TRAINED)) if held else ()
+    out, held = [view for view in known.views if view.held_out and shows(view)], list[Held]()
+    for view in (out[k] for k in evenly(len(out), held_out)):
+        off = error_of(gaussians, view, known.background)
+        if off.counts.any():
+            (carried, by), alpha = blended(gaussians, off.camera, errors, seen)
+            held.append(
+                Held(view.name, off.camera, off.error.numpy(), carried, alpha, by, off.counts.numpy())
+            )
     factor = calibrated(held)
-    return Trust(gaussians, factor * errors, seen, factor, held, trained)
+    return Trust(gaussians, factor * errors, seen, factor, tuple(held))
 
 
 def _back(
@@ -210,7 +200,7 @@ def _back(
     render = gaussians.rasterize(camera, values, near_plane=gaussians.near_plane())[0][0]
     if counts is not None:
         pixels = (pixels + FLOOR) / (render.detach() + FLOOR) * counts[..., None]
-    render.backward(pixels)
+    (render * pixels).sum().backward()  # one number: for a picture torch would import sympy, for seconds
     assert values.grad is not None
     return values.grad
 
@@ -222,35 +212,20 @@ class Off:
     camera: Camera
     error: Tensor  # [H, W], mean of the channels, white is 1; 0 where it does not count
     counts: Tensor  # [H, W], bool, by its mask
-    psnr: float  # dB
-
-
-def error_of(
-    gaussians: Gaussians, view: KnownCamera, background: tuple[float, float, float], psnr: bool = False
-) -> Off:
-    """The error of a view's render; with `psnr` that of the size that the photo was kept in, else at the
-    smaller size of the error."""
-    assert view.photo is not None
-    with Image.open(view.photo) as file:
-        picture = file.convert("RGB")
-    large = None
-    if psnr and max(picture.size) > TRUST_SIDE:
-        large = _off(gaussians, view, picture, background).psnr
-    picture.thumbnail((TRUST_SIDE, TRUST_SIDE), Image.Resampling.LANCZOS)
-    off = _off(gaussians, view, picture, background)
-    return off if large is None else replace(off, psnr=large)
 
 
 @torch.no_grad()
-def _off(
-    gaussians: Gaussians, view: KnownCamera, picture: Image.Image, background: tuple[float, float, float]
-) -> Off:
-    """Of the photo at this size."""
+def error_of(gaussians: Gaussians, view: KnownCamera, background: tuple[float, float, float]) -> Off:
+    """The error of a view's render."""
+    assert view.photo is not None
+    with Image.open(view.photo) as file:
+        picture = file.convert("RGB")
+    picture.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
     camera = resized_camera(view.camera, picture.width, picture.height)
     counts = torch.from_numpy(counted(view, picture.size))
     render = gaussians.render(camera, background=background).clamp(0, 1)
     off = (render - torch.from_numpy(np.array(picture)).float() / 255) * counts[..., None]
-    return Off(camera, off.abs().mean(-1), counts, psnr_of(off[counts]))
+    return Off(camera, off.abs().mean(-1), counts)
 
 
 def shows(view: KnownCamera) -> bool:
@@ -269,6 +244,56 @@ def counted(view: KnownCamera, size: tuple[int, int]) -> NDArray[np.bool_]:
         return np.array(file.convert("L").resize(size, Image.Resampling.BOX)) == 255
 
 
-def psnr_of(off: Tensor) -> float:
-    """dB, of differences where white is 1; 100 where there are none."""
-    return -10 * math.log10(max(float(off.square().mean()), 1e-10)) if off.numel() else 100.0
+@dataclass(frozen=True)
+class Measured:
+    """A map of trust against the held-out photos of its run, over all of their pixels.
+
+    Each photo is judged by a calibration on the others; a single one by none.
+    """
+
+    photos: int
+    covered: float  # share of the pixels whose error stays below its bound; 0.9 was promised
+    good: float  # share of those with a bound of at most GOOD
+    right: float  # share of the good ones with an error of at most GOOD
+    ause: float  # area between the sparsification curves of trust and of the true error, over the mean error
+    by_photos: float  # the same of the number of photos that see a pixel
+
+    def __str__(self) -> str:
+        right = f", {100 * self.right:.1f} % of them are" if self.good else ""
+        return (
+            f"on {self.photos} held-out photo{'s' * (self.photos > 1)} {100 * self.covered:.1f} % of the "
+            f"pixels stay below their bound; {100 * self.good:.1f} % are called good to {GOOD:.0f} levels"
+            f"{right}; AUSE {self.ause:.3f}, by the number of photos that see a pixel {self.by_photos:.3f}"
+        )
+
+
+def measure_trust(trust: Trust) -> Measured | None:
+    """None where the run has no held-out photo."""
+    held, pixels = trust.held, 0
+    if not held:
+        return None
+    below = good = right = 0
+    areas = list[tuple[float, float]]()
+    for k, one in enumerate(held):
+        factor = calibrated([*held[:k], *held[k + 1 :]])
+        bound, error = one.flat(bound_of(factor * one.carried, one.alpha)), 255 * one.flat(one.error)
+        called = bound <= GOOD
+        pixels += error.size
+        below += int((error <= bound).sum())
+        good += int(called.sum())
+        right += int((called & (error <= GOOD)).sum())
+        areas.append((_ause(bound, error), _ause(-one.flat(one.seen), error)))
+    ause, by_photos = np.mean(areas, axis=0).tolist()
+    return Measured(len(held), below / pixels, good / pixels, right / max(good, 1), ause, by_photos)
+
+
+def _ause(doubt: Array, error: Array) -> float:
+    """Area under the mean error of the pixels least in doubt, over all shares of them, less that of those
+    with the least error, over the mean of all."""
+
+    def curve(key: Array) -> NDArray[np.float64]:
+        sums = error[np.argsort(key, kind="stable")].cumsum(dtype=np.float64)
+        ends = np.linspace(0, len(error), 50 + 1)[1:].astype(int).clip(1)
+        return sums[ends - 1] / ends
+
+    return float((curve(doubt) - curve(error)).mean() / max(float(error.mean()), 1e-9))

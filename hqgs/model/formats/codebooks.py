@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from numpy.typing import NDArray
-
-from hqgs.base.machine import AT_ONCE
 
 CODES = 256  # values of a codebook
 ROUNDS = 8  # of Lloyd's algorithm
@@ -33,41 +33,28 @@ def palette(rows: NDArray[np.floating], weights: Array, wanted: int) -> tuple[Ar
     """Up to `wanted` sets of values [P, D] that stand for the rows [N, D], and each row's number [N]; N > 0.
 
     k-means twice: of all rows, then in each cluster with its part of the sets, by how far its rows scatter:
-    so a row is compared with few. `weights` [N], above 0, say how much a row counts.
+    so a row is compared with few. `weights` [N], above 0, say how much a row counts in its set.
     """
     rows = rows.astype(np.float64)
-    coarse = _kmeans(rows, weights, round(wanted**0.5))
+    coarse = _kmeans(rows, round(wanted**0.5))
     members = [np.flatnonzero(coarse == k) for k in np.unique(coarse)]
     scatter = [np.square(rows[m] - rows[m].mean(0)).sum(1) @ weights[m] for m in members]
     shares = np.cumsum(scatter) / max(np.sum(scatter), np.finfo(np.float64).tiny)
     counts = 1 + np.diff(np.rint(shares * (wanted - len(members))).astype(int), prepend=0)
     labels, found = np.zeros(len(rows), np.int64), 0
     for m, count in zip(members, counts, strict=True):
-        numbers, labels[m] = np.unique(_kmeans(rows[m], weights[m], count), return_inverse=True)
+        numbers, labels[m] = np.unique(_kmeans(rows[m], count), return_inverse=True)
         labels[m] += found
         found += len(numbers)
-    return _means(rows, weights, labels, found), labels
+    totals = np.bincount(labels, weights, found)
+    return np.stack([np.bincount(labels, weights * c, found) / totals for c in rows.T], axis=1), labels
 
 
-def _kmeans(rows: Array, weights: Array, count: int) -> NDArray[np.int64]:
-    """The number of each row's cluster, of at most `count`, by Lloyd's algorithm."""
+def _kmeans(rows: Array, count: int) -> NDArray[np.int64]:
+    """The number of each row's cluster, of at most `count`."""
+    from scipy.cluster.vq import kmeans2  # here: to read a file needs no scipy
+
     centers = np.unique(rows[np.linspace(0, len(rows) - 1, max(1, count)).astype(int)], axis=0)
-    labels = _nearest(rows, centers)
-    for _ in range(ROUNDS if len(centers) < len(rows) else 0):
-        used, labels = np.unique(labels, return_inverse=True)
-        centers = _means(rows, weights, labels, len(used))
-        labels = _nearest(rows, centers)
-    return labels
-
-
-def _means(rows: Array, weights: Array, labels: NDArray[np.int64], count: int) -> Array:
-    """The weighted mean [count, D] of the rows of each label."""
-    totals = np.bincount(labels, weights, count)
-    return np.stack([np.bincount(labels, weights * column, count) / totals for column in rows.T], axis=1)
-
-
-def _nearest(rows: Array, centers: Array) -> NDArray[np.int64]:
-    half = 0.5 * np.square(centers).sum(1)
-    step = max(1, AT_ONCE // len(centers))
-    parts = [rows[at : at + step] for at in range(0, len(rows), step)]
-    return np.concatenate([np.argmin(half - part @ centers.T, axis=1) for part in parts])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of clusters that became empty
+        return kmeans2(rows, centers, iter=ROUNDS, minit="matrix", missing="warn")[1]

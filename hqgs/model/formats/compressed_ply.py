@@ -74,7 +74,9 @@ def write_compressed_ply(path: Path, arrays: Arrays) -> int:
     elements = [PlyElement.describe(chunks, "chunk"), PlyElement.describe(words, "vertex")]
     if count := 3 * g["shN"].shape[1]:
         rest = g["shN"].astype(np.float64).transpose(0, 2, 1).reshape(n, count)
-        levels = np.floor((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8)
+        # No byte stands for 0: its two neighbours take turns, or colours would all shift to one side.
+        turns = (rest == 0) & ((np.arange(n)[:, None] + np.arange(count)) % 2 == 0)
+        levels = (np.floor((rest / 8 + 0.5) * 256) - turns).clip(0, 255).astype(np.uint8)
         names = [(f"f_rest_{k}", "u1") for k in range(count)]
         elements.append(PlyElement.describe(np.ascontiguousarray(levels).view(names)[:, 0], "sh"))
     comments = comments_of({"antialiased": arrays.get("antialiased", False)})  # its frame is said beside it

@@ -1,13 +1,28 @@
-"""Small line charts as SVG text."""
+"""The templates of pages, and their charts as SVG text: lines, and the cameras from above."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from hqgs.show.page.filled import filled
+from hqgs.scene.faces import photo_name
+from hqgs.scene.next_photos import Spot, around, loose_photos
+from hqgs.scene.scene import Scene
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+
+def filled(template: str, **values: Any) -> Markup:
+    """A template with these values, which are escaped."""
+    from jinja2 import Environment, FileSystemLoader  # here: only a page needs it
+
+    loader = FileSystemLoader(TEMPLATES)
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return Markup(environment.get_template(template).render(**values))
 
 
 def line_chart(title: str, unit: str, lines: Sequence[Sequence[tuple[float, float]]], color: str) -> Markup:
@@ -46,3 +61,45 @@ def _ticks(low: float, high: float) -> list[float]:
 
 def _number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+
+
+def places_chart(scene: Scene, spots: Sequence[Spot]) -> Markup | None:
+    """How sure each camera's place is, and the spots to photograph next; None of photos of one place."""
+    width, height, border = 640, 420, 24  # px, as the template has them
+    views = [*scene.train, *scene.test]
+    if len(views) < 2:
+        return None
+    middle, plane = around(scene)
+    cameras = (np.stack([view.camera.center for view in views]) - middle) @ plane.T
+    points = (scene.points[:: max(1, len(scene.points) // 300)].astype(np.float64) - middle) @ plane.T
+    near = np.linalg.norm(points, axis=1)
+    points = points[near <= np.percentile(near, 90)] if len(points) else points
+    stars = np.array([(spot.at - middle) @ plane.T for spot in spots]).reshape(-1, 2)
+    all_of_them = np.concatenate([cameras, points, stars])
+    low, high = all_of_them.min(0), all_of_them.max(0)
+    scale = min(
+        (width - 2 * border) / max(high[0] - low[0], 1e-9),
+        (height - 2 * border) / max(high[1] - low[1], 1e-9),
+    )
+    if not np.isfinite(scale):
+        return None
+    center = (low + high) / 2
+
+    def at(place: np.ndarray) -> tuple[float, float]:
+        x, y = (place - center) * scale + np.array([width, height]) / 2
+        return round(float(x), 1), round(float(y), 1)
+
+    named = {name for spot in spots for name in spot.photos}
+    sure = {} if scene.sfm is None else scene.sfm.sure_px
+    loose, shown = loose_photos(scene), []
+    for view, place in zip(views, cameras, strict=True):
+        ahead = plane @ view.camera.viewmat[2, :3]
+        length = float(np.linalg.norm(ahead))
+        ahead = ahead / length * 9 if length > 1e-6 else np.zeros(2)
+        photo = photo_name(view.name, view.face)
+        px = sure.get(photo)
+        words = view.name if px is None else f"{view.name}: sure to {px:.2f} px"
+        name = next((name for name in (view.name, photo) if name in named), "")
+        shown.append((*at(place), *at(place + ahead / scale), photo in loose, words, name))
+    told = [(*at(place), spot.told) for spot, place in zip(spots, stars, strict=True)]
+    return filled("places.svg.j2", points=[*map(at, points)], cameras=shown, spots=told)

@@ -27,9 +27,9 @@ from hqgs.evaluation.judge_words import (
     wrong_frame,
 )
 from hqgs.photos.pixels import png, upright
-from hqgs.show.constants import DIFFERENCE_SHOWN, WORST_SHOWN
-from hqgs.show.page.filled import filled
+from hqgs.show.page.charts import filled
 from hqgs.show.page.page import pair
+from hqgs.show.trust import WORST_SHOWN
 
 COLORS = ("#d0672a", "#8a5fbf", "#7a7a7a", "#b8c4d0", "#c9b458", "#2f7fc4", "#3f9b57")
 
@@ -107,7 +107,7 @@ def _pair(
         maps.append(_png(np.repeat(grey[..., None], 3, 2), view.quarter_turns))
         other = None if against is None else against["views"][view.name]["causes"]
         if other is not None:
-            apart = (_levels(other) - levels)[..., None] / DIFFERENCE_SHOWN  # above 0: the one is nearer
+            apart = (_levels(other) - levels)[..., None] / 16  # above 0: the one is nearer
             apart = apart.clip(-1, 1)
             tint = np.where(apart > 0, np.array([47, 127, 196]), np.array([200, 60, 50]))
             maps.append(_png(255 + np.abs(apart) * (tint - 255), view.quarter_turns))

@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from hqgs.model.constants import SH_C0
 from hqgs.model.formats.codebooks import palette
 from hqgs.model.gaussians import Gaussians
-from hqgs.show.constants import BAND_COVERED, GAUSSIANS_A_SET, LEAST_SETS, MOST_SETS, PAGE_GAUSSIANS
 from hqgs.show.export import along_a_curve
 
 COLORS = (-0.25, 1.25)
@@ -53,7 +52,7 @@ class PackedScene:
         return len(self.data)
 
 
-def pack_scene(gaussians: Gaussians, most: int = PAGE_GAUSSIANS) -> PackedScene:
+def pack_scene(gaussians: Gaussians, most: int = 400_000) -> PackedScene:
     """Quantise the Gaussians, or of more than `most` those that show most; NaN, Inf and invisible ones go.
 
     What shows most has the largest opacity times area. Many Gaussians share a set of harmonics, so that the
@@ -80,9 +79,8 @@ def pack_scene(gaussians: Gaussians, most: int = PAGE_GAUSSIANS) -> PackedScene:
     opacities = g.activated_opacities().double().numpy()
     rest, labels = np.zeros((0, 3 * g.shN.shape[1])), np.zeros(n, np.int64)
     if n and degree:
-        rest, labels = palette(
-            g.shN.flatten(1).numpy(), opacities, min(n, MOST_SETS, max(-(-n // GAUSSIANS_A_SET), LEAST_SETS))
-        )
+        sets = min(n, 1 << 13, max(-(-n // 8), 1 << 11))  # eight Gaussians share one
+        rest, labels = palette(g.shN.flatten(1).numpy(), opacities, sets)
     tops = [_top(rest[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)]) for d in range(1, degree + 1)]
     units = np.repeat(tops, [3 * (2 * d + 1) for d in range(1, degree + 1)]) if degree else np.ones(0)
     parts = [
@@ -118,5 +116,6 @@ def _planes(values: NDArray[Any]) -> bytes:
 
 
 def _top(values: NDArray[np.float64]) -> float:
-    top = float(np.quantile(np.abs(values), BAND_COVERED)) if values.size else 0.0
+    """What a band's largest stored value stands for."""
+    top = float(np.quantile(np.abs(values), 0.999)) if values.size else 0.0
     return top if math.isfinite(top) and top > 0 else 1.0

@@ -26,16 +26,16 @@ from hqgs.evaluation.records import HistoryEntry, Json, PlanRowRecord, Report, V
 from hqgs.evaluation.verdict import judged_by, told, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
+from hqgs.scene.camera_files import load_cameras
 from hqgs.scene.next_photos import next_photos
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
-from hqgs.show.constants import PAGE_QUALITY, PAIR_SIDE, PAIRS, SHEET_SIDE
-from hqgs.show.page.charts import line_chart
-from hqgs.show.page.filled import TEMPLATES, filled
+from hqgs.show.frames import trust_picture
+from hqgs.show.page.charts import TEMPLATES, filled, line_chart, places_chart
 from hqgs.show.page.packing import pack_scene
-from hqgs.show.page.places import places_chart
-from hqgs.show.page.trust_part import trust_part
+from hqgs.show.trust import ROUNDS, learn_trust, measure_trust
 
+PAIR_SIDE = 720  # px, of a picture
 SCRIPTS = ("splat_shaders.js", "splats.js")
 CHARTS = (
     ("Held-out PSNR", "dB", "psnr", "#2f7fc4"),
@@ -107,7 +107,6 @@ def page_text(page: Page) -> str:
     diagnosis, spots, trust = page.diagnosis, next_photos(page.scene), None
     if page.folder is not None and page.gaussians is not None and len(page.gaussians):
         trust = trust_part(page.folder, page.gaussians, report["iterations"])
-        spots = [*spots, *trust.spots]
     return filled(
         "report.html.j2",
         title=f"{report['scene']}, {report['method']}",
@@ -131,7 +130,7 @@ def page_text(page: Page) -> str:
             for record, words in zip(report["learned"], learned, strict=True)
         ],
         learned_heads=["photo", *dict.fromkeys(head for words in learned for head in words)],
-        pictures={Path(name).stem: jpeg(picture, SHEET_SIDE) for name, picture in page.pictures.items()},
+        pictures={Path(name).stem: jpeg(picture, 1080) for name, picture in page.pictures.items()},
         left_out=[_left_out(item) for item in report["left_out"] if not _correction(item)],
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],
@@ -144,6 +143,35 @@ def page_text(page: Page) -> str:
         environment=_environment(report),
         config=json.dumps(report["config"], indent=1),
     )
+
+
+@dataclass(frozen=True)
+class TrustPart:
+    """How far renders of other places can be believed, and pictures of the held-out photo shown worst."""
+
+    line: str
+    name: str = ""
+    pictures: tuple[tuple[str, Image.Image], ...] = ()  # what they are, and they
+
+
+def trust_part(folder: Path, gaussians: Gaussians, iterations: int) -> TrustPart:
+    """Of a run that has written its cameras and photos into a folder.
+
+    As many photos are looked at as take about 6 % of the views that its steps took.
+    """
+    photos = min(max(round(0.06 * iterations / (ROUNDS + 1)), 4), 64)
+    trust = learn_trust(gaussians, load_cameras(folder), photos, held_out=photos)
+    measured = measure_trust(trust)
+    if measured is None:
+        why = "No photo was held out, so no number says how far renders of other places can be believed."
+        return TrustPart(why)
+    by = "Each photo is judged by a calibration on the others" if measured.photos > 1 else "Not calibrated"
+    one = max(trust.held, key=lambda held: held.flat(held.error).mean())
+    render = to_uint8(gaussians.render(one.camera).detach().numpy())
+    maps = {"render": render, "trust": trust_picture(trust.bound(one.camera))}
+    maps["error"] = trust_picture(255 * one.error)
+    pictures = tuple((what, Image.fromarray(shown)) for what, shown in maps.items())
+    return TrustPart(f"Trust: {measured}. {by}.", one.name, pictures)
 
 
 def _sure(report: Report) -> list[tuple[str, str]]:
@@ -218,7 +246,7 @@ def _chosen(views: Sequence[RenderedView], measured: dict[str, ViewMetricValues]
         return -np.inf if value is None else value
 
     ordered = sorted(range(len(views)), key=psnr, reverse=True)
-    places = evenly(len(ordered), PAIRS)
+    places = evenly(len(ordered), 8)
     return [views[ordered[k]] for k in places]
 
 
@@ -238,7 +266,7 @@ def pair(view: RenderedView, metrics: Mapping[str, Any] | None) -> dict[str, str
 def jpeg(picture: Image.Image, side: int = PAIR_SIDE) -> str:
     picture, file = picture.copy(), io.BytesIO()
     picture.thumbnail((side, side), Image.Resampling.LANCZOS)
-    picture.save(file, "JPEG", quality=PAGE_QUALITY)
+    picture.save(file, "JPEG", quality=82)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
 
 

@@ -18,12 +18,11 @@ from functools import wraps
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from hqgs.show.constants import MAX_MESSAGE, PORT
-
 if TYPE_CHECKING:
     import viser
 
-HOST = "127.0.0.1"
+HOST, PORT = "127.0.0.1", 8080
+MAX_MESSAGE = 1 << 20  # bytes; what a page of ours sends takes hundreds
 # Words for those whose browser is not on this machine: a container, a remote editor, a notebook in a cloud.
 ELSEWHERE = (
     "From another machine, forward the port to it under the same number: "

@@ -14,9 +14,11 @@ from PIL import Image, ImageDraw, ImageFont
 from hqgs.scene.paths import view_matrix
 from hqgs.scene.scene import Camera
 from hqgs.scene.world import World
-from hqgs.show.constants import BAR, BAR_MARGIN, BAR_TEXT, BAR_THICK, CLICK_ERROR, CLICKED, SOLID
 from hqgs.show.frames import Activated
 from hqgs.show.viewer.pictures import Picture
+
+CLICKED = 3  # px a side, of the little picture around a click
+CLICK_ERROR = 1e-3  # radians: what a click is off
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ def picked(scene: Activated, origin: Sequence[float], direction: Sequence[float]
     R = np.stack([right, np.cross(ahead, right), ahead]).astype(np.float64)
     depth, alpha = scene.depth(Camera(CLICKED, CLICKED, K, view_matrix(R, eye)))
     middle = CLICKED // 2
-    if not alpha[middle, middle] >= SOLID:
+    if not alpha[middle, middle] >= 0.5:
         return None
     far = float(depth[middle, middle])
     at = eye + far * ahead
@@ -70,7 +72,8 @@ def told_points(a: Point, b: Point, world: World) -> str:
 
 def with_bar(picture: Picture, camera: Camera, depth: float, world: World) -> Picture:
     """The picture with a bar that is as long as it says at that depth (world units)."""
-    longest = BAR * picture.shape[1] * depth / camera.K[0, 0] * world.unit
+    margin, thick, high = 16, 4, 16  # px
+    longest = 0.25 * picture.shape[1] * depth / camera.K[0, 0] * world.unit
     if not 0 < longest < math.inf:
         return picture
     power = 10.0 ** math.floor(math.log10(longest))
@@ -78,11 +81,11 @@ def with_bar(picture: Picture, camera: Camera, depth: float, world: World) -> Pi
     pixels = length / world.unit / depth * camera.K[0, 0]
     shown = Image.fromarray(picture)
     draw = ImageDraw.Draw(shown)
-    x, y = BAR_MARGIN, picture.shape[0] - BAR_MARGIN
-    draw.rectangle((x - 1, y - BAR_THICK - 1, x + pixels + 1, y + 1), fill=(0, 0, 0))
-    draw.rectangle((x, y - BAR_THICK, x + pixels, y), fill=(255, 255, 255))
+    x, y = margin, picture.shape[0] - margin
+    draw.rectangle((x - 1, y - thick - 1, x + pixels + 1, y + 1), fill=(0, 0, 0))
+    draw.rectangle((x, y - thick, x + pixels, y), fill=(255, 255, 255))
     text = f"{length:g} {'m' if world.metres else 'units'}"
-    place, font = (x, y - BAR_THICK - BAR_TEXT - 6), ImageFont.load_default(BAR_TEXT)
+    place, font = (x, y - thick - high - 6), ImageFont.load_default(high)
     draw.text(place, text, fill=(255, 255, 255), font=font, stroke_width=2, stroke_fill=(0, 0, 0))
     return np.array(shown)
 

@@ -25,19 +25,51 @@ from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import KnownCamera, RunCameras, save_path
 from hqgs.scene.paths import UP, camera_path, focus
 from hqgs.scene.scene import Camera
-from hqgs.show.constants import PORT, SHARP, THUMB
 from hqgs.show.frames import Activated
 from hqgs.show.trust import LazyTrust
-from hqgs.show.viewer.client import Client
-from hqgs.show.viewer.guard import start_server
+from hqgs.show.viewer.guard import PORT, start_server
 from hqgs.show.viewer.measure import Ruler
-from hqgs.show.viewer.pictures import Pose, beside, same_view, shown
-from hqgs.show.viewer.splats import browser_splats
+from hqgs.show.viewer.pictures import Pose, beside, browser_splats, same_view, shown
 
+SHARP = 800  # px: height of a picture at rest
 FREE = "(free)"
 BLACK = np.zeros((1, 1, 3), np.uint8)  # what is behind the Gaussians
 RASTERIZER, BROWSER = "rasterizer", "browser"  # who draws
 PATH_FILE = "camera_path.json"
+
+
+class Client:
+    """A page: what it waits for."""
+
+    def __init__(self, handle: Any) -> None:
+        self.handle = handle
+        self.stale: bool = True  # what it shows is not what it should
+        self.coarse: int = SHARP // 2  # px, of a picture while it moves
+        self._last_move = 0.0
+        self._is_sharp = False
+
+    def moved(self) -> None:
+        """Its camera has another pose."""
+        self._last_move = time.monotonic()
+        self.stale = True
+
+    def waits(self) -> bool:
+        """Whether it needs a picture: another one, or the same sharper."""
+        return self.stale or (not self._is_sharp and self._rests())
+
+    def begin(self) -> bool:
+        """A picture for it is begun: whether a sharp one."""
+        self.stale, self._is_sharp = False, self._rests()
+        return self._is_sharp
+
+    def took(self, seconds: float, height: int, sharp: bool) -> None:
+        """Choose the height of the next coarse picture by the time of this one."""
+        if not sharp:  # 0.06 s is what a moving picture may take, 96 px its least height
+            wanted = height * (0.06 / max(seconds, 1e-3)) ** 0.5
+            self.coarse = int(min(max(0.5 * (self.coarse + wanted), 96), SHARP))
+
+    def _rests(self) -> bool:
+        return time.monotonic() - self._last_move > 0.2
 
 
 class Viewer:
@@ -236,7 +268,7 @@ class Viewer:
             view, image = views[k], None
             if view.photo is not None and view.photo.is_file():
                 with Image.open(view.photo) as file:
-                    file.thumbnail((THUMB, THUMB))
+                    file.thumbnail((160, 160))
                     image = np.asarray(file.convert("RGB"))
             camera = view.camera
             handle = self._server.scene.add_camera_frustum(
