@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -114,7 +115,8 @@ def test_degrade_writes_a_scene_that_trains(
     command = ["degrade", "embedded", "--kind", "lowres:2+jpeg:30", "--out", bad, "--downscale", "2"]
     assert call(*command, "--seed", "4") == 0
     assert asked == [{"cache": None, "size": (252, 189)}]
-    assert capsys.readouterr().out == f"{bad}: 5 training photos with lowres:2+jpeg:30, 1 held out\n"
+    told = capsys.readouterr().out
+    assert told.endswith(f"{bad}: 5 training photos with lowres:2+jpeg:30, 1 held out\n")
     assert json.loads((bad / "degradation.json").read_text())["seed"] == 4
     assert call("train", bad, "--iterations", "2", "--out", tmp_path / "run") == 0
     (note,) = json.loads((tmp_path / "run" / "report.json").read_text())["notes"]
@@ -366,6 +368,24 @@ def test_closed_output_is_no_failure(words: str, code: int) -> None:
     assert subprocess.run(["bash", "-c", line], check=False).returncode == code
 
 
+def test_names_that_a_console_cannot_show_fail_no_run(tmp_path: Path) -> None:
+    """A run folder, and the photos', whose names are no UTF-8, told on a console of ASCII."""
+    photos = write_transforms(make_truth(4), tmp_path / os.fsdecode(b"caf\xe9"))
+    run = tmp_path / os.fsdecode(b"\xc3\xa9t\xe9")
+    train = ["train", photos, "--out", run, "--iterations", "2", "--method", "3dgs"]
+    for command in (train, ["info", run], ["judge", run], ["train", photos, "--out", run]):
+        done = subprocess.run(
+            [sys.executable, "-m", "hqgs", *command],
+            env={**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "PYTHONPATH": os.getcwd()},
+            capture_output=True,
+            check=False,
+        )
+        wanted = 2 if command[0] == "train" and (run / "report.json").exists() and done.returncode else 0
+        assert done.returncode == wanted, done.stderr
+        assert b"Traceback" not in done.stderr
+    assert {"report.json", "report.html", "scene.ply"} <= {path.name for path in run.iterdir()}
+
+
 def test_ctrl_c_while_the_scene_is_read_is_exit_code_130(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -417,7 +437,7 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
     assert call("eval", tmp_path) == 0
     assert "fitted" not in capsys.readouterr().out
     report = json.loads((tmp_path / "report.json").read_text())
-    report["learned"] = [{"name": "view1.png", "gains": [1.2, 1.0, 1.0]}]
+    report["learned"] = [{"name": f"view{k}.png", "gains": [1.0 + k / 5, 1.0, 1.0]} for k in (0, 1)]
     (tmp_path / "report.json").write_text(json.dumps(report))
     assert call("judge", tmp_path, "--fit-cameras", "--out", tmp_path / "judged") == 0
     aligned = report["metrics"]["mean"]["psnr_aligned"]

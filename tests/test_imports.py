@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import hqgs
+from hqgs.cli.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 HEAVY = {"kornia", "matplotlib", "piq", "pycolmap", "scipy"}
@@ -91,6 +92,47 @@ for arguments, wanted, text in {ANSWERS!r}:
     assert text in told.getvalue(), (arguments, told.getvalue())
 """
     assert not loaded(program) & {*HEAVY, "torch"}
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_waits_for_nothing_that_it_does_not_need(command: str) -> None:
+    """`hqgs --help` for Python alone, that of a command for its parser; export lists what formats hold."""
+    arguments = [command, "--help"] if command else ["--help"]
+    program = f"""
+from hqgs.cli.main import main
+try:
+    main({arguments!r})
+except SystemExit:
+    pass
+print()
+"""
+    needed = {"tyro"} if command else set[str]()
+    needed |= {"numpy", "PIL", "plyfile"} if command == "export" else set()
+    kept = {*HEAVY, "torch", "numpy", "tyro", "rich", "filelock", "PIL", "jinja2", "plyfile"}
+    assert loaded(program) & kept <= needed
+
+
+@pytest.mark.parametrize("command", ["train PHOTOS --out RUN", "plan PHOTOS", "judge a.ply --photos PHOTOS"])
+def test_the_first_line_comes_before_what_takes_seconds(command: str, tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.png").touch()
+    (tmp_path / "a.ply").touch()
+    words = command.replace("PHOTOS", str(tmp_path / "photos")).replace("RUN", str(tmp_path / "run"))
+    words = words.replace("a.ply", str(tmp_path / "a.ply"))
+    program = f"""
+import builtins
+from hqgs.cli.main import main
+own, said = print, []
+def first(*words, **more):
+    own(*words)
+    said.append(words)
+    if len(said) == 1:
+        raise ValueError("that is enough")
+builtins.print = first
+assert main({words.split()!r}) == 2
+builtins.print = own
+"""
+    assert not loaded(program) & {*HEAVY, "torch", "rich"}
 
 
 def test_every_public_name_is_there() -> None:

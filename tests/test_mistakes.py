@@ -42,7 +42,7 @@ MISTAKES = {
     f"{TRAIN} --iterations 0": "iterations is 0, wanted at least 1",
     f"{TRAIN} --iterations 1e4": "--iterations is 1e4, wanted a whole number",
     f"{TRAIN} --iterations 9 --seconds 5": "only one of --iterations and --seconds can be given",
-    f"{TRAIN} --preset fast": "--preset is fast, wanted one of: quick, standard, best",
+    f"{TRAIN} --preset fast": "--preset is fast, wanted one of: 'quick', 'standard', 'best'",
     f"{TRAIN} --method gaussian": "unknown method 'gaussian'; the methods are: ",
     f"{TRAIN} --downscale 0.5": "downscale must be at least 1, got 0.5",
     f"{TRAIN} --degrade jpg:10": "unknown degradation 'jpg'; there are: jpeg, ",

@@ -134,7 +134,7 @@ def test_a_bare_file_gets_an_orbit(folder: Path, tmp_path: Path) -> None:
         (["--fps", "fast"], "--fps is fast, wanted a number"),
         (["--fps", "0"], "fps is 0.0, wanted a number above 0"),
         (["--show", "normals"], "--show is normals, wanted one of: 'color', 'depth', 'alpha'"),
-        (["--size", "7"], "--size is 7, wanted two whole numbers"),
+        (["--size", "7", "x"], "--size is 7 x, wanted two whole numbers"),
         (["--size", "0", "4"], "the size is 0 x 4, wanted at least 1 x 1"),
         (["--out", "/dev/null/x.gif"], "--out /dev/null/x.gif lies below /dev/null, which is a file"),
         (["--out", "film.txt"], "film.txt is no folder"),

@@ -148,7 +148,7 @@ def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFix
         ),
         (["train", "x", "z", "--out", "y"], "one argument too many: z (hqgs train --help)"),
         (["train", "x"], "missing: --out DIR"),
-        (["train", "x", "--out", "y", "--preset", "fast"], "--preset is fast, wanted one of: quick, "),
+        (["train", "x", "--out", "y", "--preset", "fast"], "--preset is fast, wanted one of: 'quick', "),
         (["view", "x", "--port", "a"], "--port is a, wanted a whole number"),
         (["export", "x", "--out", "y", "--sh-bits", "8", "q"], "--sh-bits is 8 q, wanted two whole numbers"),
         (["render", "x", "--out", "y", "--up", "0", "q", "0"], "--up is 0 q 0, wanted three numbers"),

@@ -14,8 +14,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from hqgs.base.text import as_text
 
 LOCK = ".lock"
@@ -139,6 +137,8 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
 
     The system frees the lock when its process ends, however it ends, so a lock never outlives its run.
     """
+    from filelock import FileLock, Timeout  # here: it takes as long as all that answers --help
+
     folder = Path(folder)
     made = missing_folders(folder)
     try:

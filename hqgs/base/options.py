@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,11 +34,7 @@ def values(metavar: str, wanted: str, *kinds: Callable[[str], Any]) -> Spec:
 
 def choice(*names: str) -> Spec:
     """One of these names."""
-
-    def name(word: str) -> str:
-        return names[names.index(word)]
-
-    return values(f"{{{','.join(names)}}}", f"one of: {', '.join(names)}", name)
+    return replace(values(f"{{{','.join(names)}}}", "", str), choices=names)
 
 
 @PLAIN.primitive_rule

@@ -15,7 +15,6 @@ from hqgs.cli.judge import check_source
 from hqgs.cli.out_folder import check_above
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import measured_scene, tell_read
-from hqgs.model.formats.files import FORMATS, format_of
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
@@ -46,6 +45,8 @@ OPTIONS = Clean
 def run(options: Clean) -> int:
     """Clean and say what it gained; return the exit code (0 done, 1 no gain or failed, 2 bad input)."""
     try:
+        from hqgs.model.formats.files import format_of  # here: --help waits for no array
+
         format = format_of(options.out, written=True)
         check_above(options.out)
         source = check_source(options.source, options.photos)
@@ -100,6 +101,8 @@ def gained(done: Cleaned) -> str:
 
 def left_out(source: Gaussians, cleaned: Gaussians, back: Gaussians, format: str) -> list[str]:
     """What the file does not hold of the source, but for what faded; `back` is the file as it is read."""
+    from hqgs.model.formats.files import FORMATS
+
     found = list[str]()
     if source.antialiased and not FORMATS[format].antialiased:
         found.append(f"the antialias flag: a .{format} file has no place for it")

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
 
 from hqgs.base.files import CONFIG, PLY, REPORT
@@ -15,7 +14,6 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import duration
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.evaluation.verdict import judged_by, verdict
-from hqgs.model.formats.files import FORMATS, has_format, scene_file
 from hqgs.scene.photo_files import is_run
 
 
@@ -32,6 +30,8 @@ OPTIONS = Info
 
 def run(options: Info) -> int:
     """Print what is there; return the exit code (0 done, 1 failed, 2 bad input)."""
+    from hqgs.model.formats.files import has_format, scene_file  # here: --help waits for no array
+
     path = options.path
     try:
         if path.is_file() and has_format(path):
@@ -53,6 +53,8 @@ def run(options: Info) -> int:
 
 
 def _file(path: Path) -> list[str]:
+    import numpy as np
+
     from hqgs.model.gaussians import Gaussians  # here: it loads torch
 
     gaussians = Gaussians.load(path)
@@ -100,12 +102,13 @@ def _told(run: RunFolder, report: Any) -> list[str]:
     lines += [f"  {note}" for note in report["notes"]]
     if (path / CONFIG).is_file():
         lines.append(f"trained on {run.loaded.get('path', 'a scene made in Python')}")
-    lines.append(f"the scene: {scene_file(path)}; the configuration: {path / CONFIG}")
+    lines.append(f"the scene: {path / PLY}; the configuration: {path / CONFIG}")
     return lines
 
 
 def _photos(path: Path) -> list[str]:
-    from hqgs.scene.load import formats_of, scene_folder  # here: they load torch
+    from hqgs.model.formats.files import FORMATS  # here: they load torch
+    from hqgs.scene.load import formats_of, scene_folder
     from hqgs.scene.sfm.bare_photos import bare_photos, readable
     from hqgs.scene.sfm.front_door import cameras_beside
 

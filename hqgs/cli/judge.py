@@ -18,7 +18,6 @@ from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import check_background, measured_scene, ready
 from hqgs.evaluation.judge_words import told
 from hqgs.evaluation.verdict import judged_by
-from hqgs.model.formats.files import format_of, scene_file
 
 if TYPE_CHECKING:
     from hqgs.evaluation.judge import Judged
@@ -63,9 +62,10 @@ def run(options: Judge) -> int:
         if options.out is not None:
             check_out_folder(options.out)
         source, other, known = check_source(options.source, options.photos), None, None
-        from hqgs.evaluation.judge import compared
+        from hqgs.evaluation.judge import compared  # here: they load torch
         from hqgs.evaluation.protocol import check_comparable, chosen_views, protocol_of, read_judgement
         from hqgs.evaluation.run_folder import RunFolder
+        from hqgs.model.formats.files import scene_file
 
         run = RunFolder.open(options.source)
 
@@ -114,6 +114,8 @@ def run(options: Judge) -> int:
 
 def check_source(source: Path, photos: str | None) -> Path:
     """The scene file that is meant, before anything that takes seconds. BAD_INPUT errors."""
+    from hqgs.model.formats.files import format_of, scene_file  # here: --help waits for no array
+
     file = scene_file(source)
     format_of(file)
     if photos is None and not (source.is_dir() and (source / CONFIG).is_file()):

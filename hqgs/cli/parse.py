@@ -26,6 +26,9 @@ WORDS = {  # tyro's, and ours
     r"Perhaps you meant:": "- did you mean",
     r"(?<=\S) (?=there is no option|missing:)": "; ",
     r"(there is no option --?[\w-]+)(?:,? [^-\s;]+)+": r"\1",  # what followed it is none of its own
+    r"invalid choice '(.*?)' for argument '(.*?)'\. Expected one of \((.*?)\)\.": (
+        r"\2 is \1, wanted one of: \3"
+    ),
     r"Error parsing (\S+):(?= is )": r"\1",
     r"Error parsing \S+: ": "",
 }

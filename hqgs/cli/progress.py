@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as Bars
-
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from hqgs.base.stages import Stage
     from hqgs.training.progress import Progress
 
@@ -28,6 +26,10 @@ class Screen:
     """Bars on stderr; nothing is left of them when it closes."""
 
     def __init__(self) -> None:
+        from rich.console import Console  # here: --help waits for neither
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bars
+
         self.console: Console = Console(stderr=True, highlight=False, soft_wrap=True)
         self.live: bool = self.console.is_terminal
         columns = (

@@ -17,8 +17,7 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.out_folder import check_above
 from hqgs.cli.scenes import check_background, tell_read
 from hqgs.evaluation.run_folder import RunFolder
-from hqgs.model.formats.files import scene_file
-from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
@@ -68,6 +67,8 @@ def run(options: Render) -> int:
     """Render, and say what was written; return the exit code (0 done, 1 failed, 2 bad input)."""
     source, out, size = options.source, options.out, options.size
     try:
+        from hqgs.model.formats.files import scene_file  # here: --help waits for no array
+
         file, run = scene_file(source), RunFolder.open(source)
         _check(options, run)
         from hqgs.evaluation.looks import look_of

@@ -48,6 +48,7 @@ def ready(scene: str) -> None:
     """Tell a wrong path at once; then load what takes seconds, after which SIGTERM counts as Ctrl-C."""
     if not is_room(scene) and film_at(scene) is None:
         existing_folder(scene)
+    print(f"reading {scene}", flush=True)
     warnings.filterwarnings(
         "ignore", category=FutureWarning, message=".*torch.jit"
     )  # of libraries, not of us

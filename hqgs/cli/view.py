@@ -15,7 +15,6 @@ import tyro
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.scenes import heed_endings, tell_read
 from hqgs.evaluation.run_folder import RunFolder
-from hqgs.model.formats.files import scene_file
 from hqgs.show.viewer.guard import ELSEWHERE, PORT, check
 
 if TYPE_CHECKING:
@@ -46,6 +45,8 @@ OPTIONS = ViewOptions
 def run(options: ViewOptions, seconds: float | None = None) -> int:
     """Show a scene until Ctrl-C, or for some seconds; return the exit code (0 done, 2 bad input)."""
     try:
+        from hqgs.model.formats.files import scene_file  # here: --help waits for no array
+
         file = scene_file(options.source)
         check(options.port)
         from hqgs.evaluation.photo_facts import facts_of_photos  # here: they load torch

@@ -31,7 +31,7 @@ def half_width(values: Sequence[float | None], metric: str | None = None) -> flo
     known = [value for value in values if value is not None]
     if len(known) < max(2, len(values)):
         return None
-    from scipy.special import stdtrit  # here: the command line waits for no scipy
+    from scipy.special import stdtrit
 
     quantile = float(stdtrit(len(known) - 1, (1 + CONFIDENCE) / 2))
     deviation = float(np.std(known, ddof=1))
@@ -73,6 +73,7 @@ def difference(one: Sequence[float | None], other: Sequence[float | None]) -> Di
     pairs = [(a, b) for a, b in zip(one, other, strict=True) if a is not None and b is not None]
     if not pairs or len(pairs) < len(one):
         return None
+
     apart = [a - b for a, b in pairs]
     return Difference(float(np.mean(apart)), half_width(apart))
 

@@ -22,9 +22,9 @@ from hqgs.evaluation.held_out import RenderedView, measured, names_of
 from hqgs.evaluation.intervals import half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
 from hqgs.evaluation.records import MetricsRecord, MetricValues, Report, RunRecord
-from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.photos.sheet import printable, sheet
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from hqgs.base.files import CAMERAS, CONFIG, PHOTOS, PICTURES, REPORT, RUN_FILES, read_json
 from hqgs.base.left_out import PHOTO
 from hqgs.base.stages import OnStage, silent
@@ -19,10 +17,12 @@ from hqgs.evaluation.records import Report, read_report
 from hqgs.scene.constants import BACKGROUND, SAME_POSE
 from hqgs.scene.options import LoadOptions
 from hqgs.scene.photo_files import is_run
-from hqgs.scene.scene import Camera, Scene
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from hqgs.scene.camera_files import RunCameras
+    from hqgs.scene.scene import Camera, Scene
 
 
 @dataclass(frozen=True)
@@ -174,6 +174,8 @@ def check_same(scene: Scene, run: RunFolder, split: bool) -> None:
 def moved_px(scene: Scene, known: RunCameras) -> float | None:
     """How far what the photos of a run show moves in them by the poses that a scene has, px: the median over
     the photos that both have; None: there are none."""
+    import numpy as np  # here: a command's options wait for nothing
+
     views = {view.name: view for view in [*scene.train, *scene.test]}
     points = scene.world.to(known.world, scene.points)
     off = list[float]()
@@ -190,6 +192,8 @@ def moved_px(scene: Scene, known: RunCameras) -> float | None:
 def _least_off(camera: Camera, viewmats: Sequence[np.ndarray], points: np.ndarray) -> float:
     """Px between where a camera and one at another pose show points of a grid across its picture, at the
     median depth of `points` [P, 3] before it: the mean; the least of several poses."""
+    import numpy as np
+
     depths = points @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
     depth = float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
     x, y = np.meshgrid(*(np.linspace(0.1, 0.9, 3) * side for side in (camera.width, camera.height)))

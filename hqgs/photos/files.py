@@ -17,10 +17,6 @@ from hqgs.photos.pixels import grey, of_16, oriented
 from hqgs.photos.profiles import Colors, colors_of, in_srgb, in_srgb_of_16
 
 LARGEST = 1 << 28  # px of a photo: more come from damaged files, and would fill the memory
-HEIC_SUFFIXES = (".heic", ".heif")  # what iPhones write; an extra reads them
-JPEG_SUFFIXES = (".jpg", ".jpeg", ".jfif", ".jpe")
-PHOTO_SUFFIXES = (".png", *JPEG_SUFFIXES, ".tif", ".tiff", ".bmp", ".webp", ".avif", ".jp2", *HEIC_SUFFIXES)
-RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".x3f")
 DECODE_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError),
     MemoryError,  # Pillow reads as many bytes as a chunk says it has

@@ -11,7 +11,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.base.text import some
-from hqgs.photos.files import PHOTO_SUFFIXES, MisfitError
+from hqgs.photos.files import MisfitError
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.constants import LARGEST, MOST_SIDE
 from hqgs.scene.faces import AROUND, Face
 from hqgs.scene.photo_files import Named, below, masks_among

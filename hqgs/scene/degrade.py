@@ -14,9 +14,9 @@ from PIL import Image
 from hqgs.base.files import atomic_path, new_folder
 from hqgs.base.text import some
 from hqgs.photos.degrade import Degraded, Record, degrade_image, degrade_sequence
-from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.formula import KINDS, Degradation
 from hqgs.photos.pixels import to_uint8
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.capture import inside
 from hqgs.scene.constants import SOME_FACTORS
 from hqgs.scene.formats.colmap import write_colmap

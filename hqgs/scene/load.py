@@ -13,7 +13,8 @@ from hqgs.base.evenly import evenly
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import as_text, some
 from hqgs.photos import profiles
-from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size, told_colors
+from hqgs.photos.files import UnreadableError, stored_size, told_colors
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene import masks
 from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, odd_lenses, photo_folder

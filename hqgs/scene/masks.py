@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from hqgs.base.evenly import evenly
 from hqgs.base.text import some
 from hqgs.photos.exif import read_exif
-from hqgs.photos.files import PHOTO_SUFFIXES, decode, decode_mask, is_shown, stored_size
+from hqgs.photos.files import decode, decode_mask, is_shown, stored_size
 from hqgs.photos.pixels import luma
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.capture import Capture, Photo
 from hqgs.scene.photo_files import Key, below, is_mask_folder, mask_keys, photo_keys
 

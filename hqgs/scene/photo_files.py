@@ -19,7 +19,7 @@ from urllib.parse import unquote
 
 from hqgs.base.files import CHECKPOINT, CONFIG, LOCK, PLY, RUN_FILES, RUN_FOLDERS
 from hqgs.base.text import some
-from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.names import FILM_SUFFIXES, KEPT
 
 MASKS = "masks"

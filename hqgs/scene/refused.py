@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hqgs.base.text import some
-from hqgs.photos.files import PHOTO_SUFFIXES, RAW_SUFFIXES
+from hqgs.photos.suffixes import PHOTO_SUFFIXES, RAW_SUFFIXES
 from hqgs.scene.capture import perhaps
 from hqgs.scene.formats.colmap import find_models, half_model
 from hqgs.scene.formats.llff import POSES

@@ -23,8 +23,8 @@ from hqgs.model.formats.arrays import curve_order
 from hqgs.model.formats.turned import matrices
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization
-from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.look import Look
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.photos.video import FPS, pyav
 from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.names import FILM_SUFFIXES

@@ -16,7 +16,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.base.files import read_json
-from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
+from hqgs.photos.files import UnreadableError, stored_size
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.capture import Capture, Photo, found_inside, inside, keep_finite, no_points, viewmat_from_pose
 from hqgs.scene.constants import MOST_SIDE, SMALLEST_SIDE
 from hqgs.scene.faces import AROUND, around

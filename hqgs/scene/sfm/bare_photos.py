@@ -18,7 +18,8 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import as_text, some
 from hqgs.photos import profiles
 from hqgs.photos.exif import Exif, read_exif
-from hqgs.photos.files import PHOTO_SUFFIXES, Glance, UnreadableError, decode, glance, needs_heic
+from hqgs.photos.files import Glance, UnreadableError, decode, glance, needs_heic
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.capture import photo_folder
 from hqgs.scene.constants import JPEG_QUALITY, MAX_WORKERS, MOST_SIDE
 from hqgs.scene.faces import CUBE, face_name
