@@ -112,13 +112,15 @@ print()
     assert loaded(program) & kept <= needed
 
 
-@pytest.mark.parametrize("command", ["train PHOTOS --out RUN", "plan PHOTOS", "judge a.ply --photos PHOTOS"])
+@pytest.mark.parametrize(
+    "command", ["train PHOTOS --out RUN", "plan PHOTOS", "judge a.splat --photos PHOTOS"]
+)
 def test_the_first_line_comes_before_what_takes_seconds(command: str, tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.png").touch()
-    (tmp_path / "a.ply").touch()
+    (tmp_path / "a.splat").write_bytes(bytes(32))
     words = command.replace("PHOTOS", str(tmp_path / "photos")).replace("RUN", str(tmp_path / "run"))
-    words = words.replace("a.ply", str(tmp_path / "a.ply"))
+    words = words.replace("a.splat", str(tmp_path / "a.splat"))
     program = f"""
 import builtins
 from hqgs.cli.main import main
