@@ -31,6 +31,14 @@ def test_the_word_rises_with_the_psnr(psnr: float | None, word: str) -> None:
     assert verdict(psnr)[0] == word
 
 
+def test_the_verdict_goes_by_the_look_of_the_photos_cameras() -> None:
+    """Gains alike for all photos are the scene's brightness, and no exposure of their own."""
+    measured = {"mean": {"psnr": 25.1, "psnr_aligned": 25.6}, "psnr_shown": 21.6, "views": []}
+    psnr, name = judged_by({"metrics": measured, "learned": 3 * [{"gains": [1.1, 1.1, 1.1]}]})
+    assert psnr == 25.1
+    assert "21.6 dB as the scene is shown" in name
+
+
 def moments(*values: tuple[float | None, float | None], views: int | None = None) -> list[Any]:
     more = {} if views is None else {"views": views}
     return [

@@ -194,6 +194,8 @@ def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
         ("photos trained on", f"{len(scene.train)}"),
         ("iterations", f"{report['iterations']:,}"),
     ]
+    if (shown := report["metrics"].get("psnr_shown")) is not None:
+        facts.insert(1, ("PSNR as shown, not in the cameras' look", f"{shown:.2f} dB"))
     if report["peak_rss_mb"] is not None:
         facts.append(("memory", f"{report['peak_rss_mb']:,.0f} MB"))
     if report["scene_bytes"] is not None:
