@@ -26,6 +26,7 @@ from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import give_back_memory, peak_rss_mb
 from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.base.state import own_state
 from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.photo_facts import photo_record
@@ -72,6 +73,7 @@ class Run:
         return self.iterations == self.length
 
 
+@own_state(grad=True)
 def train(
     scene: Scene,
     *,

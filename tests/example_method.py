@@ -6,6 +6,7 @@ put in for a test.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -28,7 +29,7 @@ class Tinted(ThreeDGS):
         self.tint = torch.zeros(3, requires_grad=True)
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
-        return Gaussians(**(gaussians.named() | {"sh0": gaussians.sh0 + self.tint}))
+        return replace(gaussians, sh0=gaussians.sh0 + self.tint)
 
     def loss(self, image: Tensor, target: Target) -> Tensor:
         return photometric_loss(image, target.photo, target.mask, lambda_dssim=0.0)

@@ -22,7 +22,6 @@ from scenes import random_scene
 import hqgs
 from benchmarks.stability.oracle import ALPHA_FLOOR, OracleScene
 from hqgs import _rust
-from hqgs.model import render
 
 OPTIONS = (0.01, 1e10, 0.0, 0.3, False, True)
 
@@ -93,7 +92,6 @@ def test_the_constants_are_those_of_the_oracles() -> None:
         assert ours[name].default == defaults[name].default == getattr(OracleScene, name) == value
     assert (_rust.NEAR_PLANE, _rust.FAR_PLANE, _rust.EPS2D) == (0.01, 1e10, 0.3)
     assert (_rust.TILE, _rust.BLOCK) == (16, 4)
-    assert OPTIONS[:4] == render.OPTIONS[:4]
 
 
 # --- memory that is shared, or changes

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from hqgs.model.gaussians import Gaussians, mean_square_distance
+from hqgs.model.shapes import as_discs, enlarge
+from hqgs.scene.world import World
 
 
 def brute_force(points: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -86,8 +91,23 @@ def test_bad_clouds_are_refused_with_the_reason() -> None:
 
 def test_shapes_must_match() -> None:
     g = Gaussians.from_points(np.eye(4, 3, dtype=np.float32), np.zeros((4, 3), np.uint8))
-    good = g.named()
+    good: dict[str, Any] = g.named()
     with pytest.raises(ValueError, match=r"quats has shape \[3, 4\], wanted \[4, 4\]"):
-        Gaussians(**(good | {"quats": torch.ones(3, 4)}))
+        Gaussians(**{**good, "quats": torch.ones(3, 4)})
     with pytest.raises(ValueError, match=r"shN has shape \[4, 5, 3\]"):
-        Gaussians(**(good | {"shN": torch.ones(4, 5, 3)}))
+        Gaussians(**{**good, "shN": torch.ones(4, 5, 3)})
+
+
+def test_what_is_no_tensor_stays_with_any_copy() -> None:
+    """Of `dataclasses.replace`, too: the frame, how it is rendered, what a file said."""
+    made = Gaussians.from_points(np.eye(5, 3), np.zeros((5, 3), np.uint8))
+    made.world, made.antialiased, made.notes = World(unit=2.0), True, ["a note"]
+    made.errors = torch.arange(5.0)
+    rows = torch.tensor([3, 1])
+    turned = replace(made, quats=made.quats + 1)
+    copies = [turned, made.detached(), as_discs(made), enlarge(made, torch.ones(5)), made.rows(rows)]
+    for copy in [*copies, made.like(made.rows(rows).named())]:
+        assert (copy.world, copy.antialiased, copy.notes) == (World(unit=2.0), True, ["a note"])
+    assert torch.equal(copies[4].errors, torch.tensor([3.0, 1.0]))  # pyright: ignore
+    assert made.like(made.rows(rows).named()).errors is None
+    assert [*made.named()] == ["means", "scales", "quats", "opacities", "sh0", "shN"]

@@ -71,6 +71,37 @@ def test_a_batch_of_pairs_of_harmonics_and_one_background() -> None:
         assert torch.equal(images[k], hqgs.rasterization(**alone)[0])
 
 
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("batch", [False, True])
+def test_harmonics_of_each_camera_are_those_of_a_camera_alone(batch: bool, packed: bool) -> None:
+    """[C, N, K, 3], as gsplat has them."""
+    scene = random_scene(40, 24, 17, cameras=3, seed=4, dtype=F64, sh_degree=2).with_grad("means", "viewmats")
+    others = [random_scene(40, 24, 17, seed=k, dtype=F64, sh_degree=2).colors for k in range(3)]
+    colors = torch.stack(others).requires_grad_()
+    arguments = scene.arguments(colors=colors, packed=packed)
+    if batch:
+        arguments |= {k: v[None] for k, v in arguments.items() if isinstance(v, torch.Tensor)}
+    images = hqgs.rasterization(**arguments)[0]
+    weights = torch.linspace(-1, 1, images.numel(), dtype=F64).view(images.shape)
+    (images * weights).sum().backward()
+    images, weights, means = (
+        images.view(3, 17, 24, 3),
+        weights.view(3, 17, 24, 3),
+        torch.zeros(40, 3, dtype=F64),
+    )
+    for k, own in enumerate(others):
+        one = scene.with_grad("means", "viewmats")
+        own = own.clone().requires_grad_()
+        camera = {name: getattr(one, name)[k : k + 1] for name in ("viewmats", "Ks", "backgrounds")}
+        image = hqgs.rasterization(**one.arguments(colors=own, **camera))[0]
+        assert torch.equal(images[k], image[0])
+        (image[0] * weights[k]).sum().backward()
+        assert torch.equal(colors.grad[k], own.grad)  # pyright: ignore
+        means += one.means.grad
+        torch.testing.assert_close(scene.viewmats.grad[k], one.viewmats.grad[k])  # pyright: ignore
+    torch.testing.assert_close(scene.means.grad, means, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

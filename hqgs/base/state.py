@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from typing import Any
 
 import numpy as np
-import torch
-
-_ERRORS = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}  # numpy's defaults
 
 
 @contextmanager
@@ -19,53 +18,37 @@ def own_state(grad: bool | None = None) -> Iterator[None]:
     `grad`: whether gradients are recorded, and tensors are none of inference; None: as the caller has it.
     """
     with ExitStack() as stack:
-        for odd in _odd(grad):
+        torch = sys.modules.get("torch")  # where it is not loaded, nobody has set anything
+        for odd in [] if torch is None else _odd(torch, grad):
             stack.enter_context(odd)
+        stack.enter_context(np.errstate(divide="warn", over="warn", under="ignore", invalid="warn"))
+        if any(action == "error" for action, *_ in warnings.filters):
+            stack.enter_context(warnings.catch_warnings())
+            warnings.simplefilter("default")
         yield
 
 
-def _odd(grad: bool | None) -> Iterator[AbstractContextManager[object]]:
-    """What puts the state right where it is not."""
+def _odd(torch: Any, grad: bool | None) -> Iterator[AbstractContextManager[object]]:
+    """What puts the state of torch right, each where it is not."""
     if torch.get_default_dtype() != torch.float32:
-        yield _float32()
+        yield _set_back(torch.set_default_dtype, torch.float32, torch.get_default_dtype())
     if torch.get_default_device().type != "cpu":
         yield torch.device("cpu")
-    if torch.are_deterministic_algorithms_enabled():
-        yield _not_deterministic()
+    if torch.are_deterministic_algorithms_enabled():  # refuses operations that have no such variant
+        mode = "warn" if torch.is_deterministic_algorithms_warn_only_enabled() else "error"
+        yield _set_back(torch.set_deterministic_debug_mode, "default", mode)
     if torch.is_autocast_enabled("cpu"):
         yield torch.autocast("cpu", enabled=False)
     if grad is not None and torch.is_inference_mode_enabled():
         yield torch.inference_mode(False)
     if grad is not None and torch.is_grad_enabled() != grad:
         yield torch.set_grad_enabled(grad)
-    if np.geterr() != _ERRORS:
-        yield np.errstate(**_ERRORS)  # pyright: ignore[reportArgumentType]
-    if any(action == "error" for action, *_ in warnings.filters):
-        yield _warnings_are_no_errors()
 
 
 @contextmanager
-def _float32() -> Iterator[None]:
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float32)
+def _set_back(setter: Any, value: object, before: object) -> Iterator[None]:
+    setter(value)
     try:
         yield
     finally:
-        torch.set_default_dtype(before)
-
-
-@contextmanager
-def _not_deterministic() -> Iterator[None]:
-    warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
-    torch.use_deterministic_algorithms(False)
-    try:
-        yield
-    finally:
-        torch.use_deterministic_algorithms(True, warn_only=warn_only)
-
-
-@contextmanager
-def _warnings_are_no_errors() -> Iterator[None]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("default")
-        yield
+        setter(before)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hqgs.base.evenly import evenly
 from hqgs.base.left_out import LeftOut
 from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.base.state import own_state
 from hqgs.diagnosis.colors import (
     DeviceSigns,
     device_findings,
@@ -161,6 +162,7 @@ class Inspector:
         return exposure, *devices, shake, focus_finding(scene, shake.needed)
 
 
+@own_state(grad=True)
 def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
     """Diagnose up to `max_photos` training photos, spread over the scene, and sum them up by medians.
 

@@ -28,6 +28,7 @@ import torch
 from numpy.typing import NDArray
 
 from hqgs import _rust
+from hqgs.base.state import own_state
 from hqgs.base.threads import one_torch_thread
 
 HAARPSI_MIN_SIZE = 16  # px: the coarsest Haar filter
@@ -55,6 +56,7 @@ class ViewMetrics:
 METRICS = tuple(value.name for value in fields(ViewMetrics) if value.name not in ("reasons", "psnr_shown"))
 
 
+@own_state(grad=False)
 def psnr(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float | None:
     """-10 log10(MSE) in dB over all channels of the pixels that count.
 
@@ -66,6 +68,7 @@ def psnr(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | No
     return -10 * math.log10(mse) if mse > 0 else None
 
 
+@own_state(grad=False)
 def psnr_aligned(
     render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None
 ) -> float | None:
@@ -89,6 +92,7 @@ def color_factors(
     return np.divide(products, squares, out=np.ones(3), where=squares > 0)
 
 
+@own_state(grad=False)
 def ssim(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
     """Structural similarity (Wang et al. 2004), per channel, mean over all pixels and channels.
 
@@ -101,6 +105,7 @@ def ssim(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | No
     return _rust.ssim(first, second)
 
 
+@own_state(grad=False)
 def haarpsi(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float | None:
     """Haar wavelet perceptual similarity (Reisenhofer et al. 2018) in colour; 1 for identical images.
 
@@ -129,6 +134,7 @@ def _piq_haarpsi() -> Any:
                 del sys.modules["piq"]
 
 
+@own_state(grad=False)
 def lpips(
     render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None, net: str = "alex"
 ) -> float | None:
@@ -150,6 +156,7 @@ def lpips_missing(net: str = "alex") -> str | None:
     return network if isinstance(network, str) else None
 
 
+@own_state(grad=False)
 def evaluate_view(
     render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None
 ) -> ViewMetrics:

@@ -128,8 +128,8 @@ def check_colors(colors: Tensor, rest: Tensor | None, n: int, c: int, sh_degree:
         if len(shape) != 3 or shape[0] != n or shape[1] < needed - 1 or shape[2] != 3:
             wanted = f"[{n}, K >= {needed - 1}, 3] for sh_degree {sh_degree}"
             raise ValueError(f"colors[1]: expected shape {wanted}, got {shape}")
-    elif len(shape) != 3 or shape[0] != n or shape[1] < needed or shape[2] != 3:
-        wanted = f"[{n}, K >= {needed}, 3] for sh_degree {sh_degree}"
+    elif shape[:-2] not in ([n], [c, n]) or shape[-2] < needed or shape[-1] != 3:
+        wanted = f"[{n}, K >= {needed}, 3] or [{c}, {n}, K, 3] for sh_degree {sh_degree}"
         raise ValueError(f"colors: expected shape {wanted}, got {shape}")
 
 

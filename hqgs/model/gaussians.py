@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 from hqgs._rust import EPS2D, NEAR_PLANE
 from hqgs.base.elementary import exp
 from hqgs.base.files import PLY
+from hqgs.base.state import own_state
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import (
     CONTENT_SAMPLED,
@@ -51,12 +52,14 @@ class Gaussians:
     opacities: Tensor  # [N], logits
     sh0: Tensor  # [N, 1, 3], the SH coefficient of degree 0
     shN: Tensor  # noqa: N815  [N, K - 1, 3], the higher coefficients; K = (sh_degree + 1)^2
-    look: Camera | None = field(default=None, init=False, compare=False)  # for notebooks; in no file
-    world: World = field(default_factory=World, init=False, compare=False)  # the frame of its files
-    antialiased: bool = field(default=False, init=False, compare=False)  # rendered with that compensation
-    errors: Tensor | None = field(default=None, init=False, compare=False)  # [N], of trust, white is 1
-    notes: list[str] = field(default_factory=list, init=False, compare=False)  # of the file it was read from
-    moved: NDArray[np.float64] | None = field(default=None, init=False, compare=False)  # see `moved_along`
+    look: Camera | None = field(default=None, kw_only=True, compare=False)  # for notebooks; in no file
+    world: World = field(default_factory=World, kw_only=True, compare=False)  # the frame of its files
+    antialiased: bool = field(default=False, kw_only=True, compare=False)  # rendered with that compensation
+    errors: Tensor | None = field(default=None, kw_only=True, compare=False)  # [N], of trust, white is 1
+    # Of the file it was read from.
+    notes: list[str] = field(default_factory=list, kw_only=True, compare=False)
+    # See `moved_along`.
+    moved: NDArray[np.float64] | None = field(default=None, kw_only=True, compare=False)
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
@@ -91,22 +94,18 @@ class Gaussians:
     def finite(self) -> Tensor:
         """Which hold no NaN or Inf in any tensor, bool [N]."""
         tensors = [
-            tensor.detach().reshape(len(self), -1) for tensor in self.named().values() if tensor.numel()
+            tensor.detach().reshape(len(self), *tensor.shape[1:], 1) for tensor in self.named().values()
         ]
-        return torch.cat([torch.zeros(len(self), 1), *tensors], dim=1).isfinite().all(dim=1)
+        return torch.cat([tensor.flatten(1) for tensor in tensors], dim=1).isfinite().all(dim=1)
 
-    def named(self) -> dict[str, Tensor]:
+    def named(self) -> dict[str, Any]:
         """The tensors by name, in the order of the fields."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.init}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
-    def like(self, tensors: dict[str, Tensor]) -> Gaussians:
+    def like(self, tensors: dict[str, Any]) -> Gaussians:
         """Others with these tensors, in the same frame and seen in the same way."""
-        made = Gaussians(**tensors)
-        made.look, made.world = self.look, self.world
-        made.antialiased, made.notes, made.moved = self.antialiased, self.notes, self.moved
-        if self.errors is not None and len(self.errors) == len(made):
-            made.errors = self.errors
-        return made
+        fits = self.errors is not None and len(self.errors) == len(tensors["means"])
+        return replace(self, **tensors, errors=self.errors if fits else None)
 
     def in_world(self, world: World) -> Gaussians:
         """The same scene, held in another frame, such as that of its photos' cameras (`Scene.world`)."""
@@ -114,10 +113,11 @@ class Gaussians:
             return self
         means = self.world.to(world, self.means.detach().double().numpy())
         grown = math.log(self.world.unlike(world) * self.world.unit / world.unit)
-        held = {"means": torch.from_numpy(means).to(self.means.dtype), "scales": self.scales + grown}
-        made = self.like(self.named() | held)
-        made.world, made.look = world, None
-        return made
+        held: dict[str, Any] = {
+            "means": torch.from_numpy(means).to(self.means.dtype),
+            "scales": self.scales + grown,
+        }
+        return replace(self, **held, world=world, look=None)
 
     def along(self, known: RunCameras | None) -> RunCameras | None:
         """The cameras that lie beside the scene's file, with the scene where another program moved that."""
@@ -137,9 +137,8 @@ class Gaussians:
 
     def rows(self, chosen: Tensor) -> Gaussians:
         """Some of them: `chosen` bool [N], or the rows' numbers [M]."""
-        made = self.like({name: tensor[chosen] for name, tensor in self.named().items()})
-        made.errors = None if self.errors is None else self.errors[chosen]
-        return made
+        rows = {name: tensor[chosen] for name, tensor in self.named().items()}
+        return replace(self, **rows, errors=None if self.errors is None else self.errors[chosen])
 
     def arrays(self) -> Arrays:
         """The same values (shared memory) as numpy arrays, by the names of the fields."""
@@ -160,6 +159,7 @@ class Gaussians:
         """Opacities [N] in (0, 1)."""
         return torch.sigmoid(self.opacities)
 
+    @own_state()
     def render(
         self, camera: Camera, *, background: Sequence[float] = BACKGROUND, sh_degree: int | None = None
     ) -> Tensor:
@@ -218,12 +218,12 @@ class Gaussians:
             self.scales,
             self.opacities,
             own if colors is None else colors,
-            torch.tensor(camera.viewmat[None]),
-            torch.tensor(camera.K[None]),
+            torch.from_numpy(np.array(camera.viewmat[None])),
+            torch.from_numpy(np.array(camera.K[None])),
             camera.width,
             camera.height,
             sh_degree=sh_degree,
-            backgrounds=None if background is None else torch.tensor([[*background]], dtype=self.means.dtype),
+            backgrounds=None if background is None else [[*background]],
             render_mode=render_mode,
             eps2d=eps2d,
             near_plane=near_plane,
@@ -232,6 +232,7 @@ class Gaussians:
             activate=True,
         )
 
+    @own_state(grad=False)
     def save(self, path: str | Path, format: str | None = None) -> int:
         """Write a scene file atomically; return how many Gaussians were left out as NaN or Inf.
 
@@ -249,6 +250,7 @@ class Gaussians:
         return write_scene(path, self.arrays(), format_of(path, format, written=True))
 
     @classmethod
+    @own_state(grad=False)
     def load(cls, path: str | Path, format: str | None = None) -> Gaussians:
         """Read a scene file, float32: ours, or one of 3DGS, gsplat, Brush, SuperSplat.
 
@@ -263,16 +265,18 @@ class Gaussians:
         """
         file = scene_file(path)
         arrays = read_scene(file, format_of(file, format))
-        made = cls(**{name: torch.from_numpy(np.ascontiguousarray(arrays[name])) for name in TENSORS})
-        made.look = first_camera(file.parent) if file.name == PLY else None
-        made.world = arrays.get("world", made.world)
-        made.antialiased, made.notes = arrays.get("antialiased", False), arrays.get("notes", [])
-        made.moved = arrays.get("moved")
-        if "errors" in arrays:
-            made.errors = torch.from_numpy(arrays["errors"])
-        return made
+        return cls(
+            **{name: torch.from_numpy(np.ascontiguousarray(arrays[name])) for name in TENSORS},
+            look=first_camera(file.parent) if file.name == PLY else None,
+            world=arrays.get("world", World()),
+            antialiased=arrays.get("antialiased", False),
+            notes=arrays.get("notes", []),
+            moved=arrays.get("moved"),
+            errors=torch.from_numpy(arrays["errors"]) if "errors" in arrays else None,
+        )
 
     @classmethod
+    @own_state(grad=False)
     def from_points(
         cls, points: NDArray[np.floating], colors: NDArray[np.uint8], sh_degree: int = MAX_SH_DEGREE
     ) -> Gaussians:

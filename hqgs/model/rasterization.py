@@ -71,8 +71,8 @@ def rasterization(
         quats: rotations w, x, y, z, [N, 4], of any norm that is not 0.
         scales: standard deviations, world units, [N, 3].
         opacities: [N].
-        colors: [N, D] or [C, N, D] channels; with `sh_degree` spherical harmonics, [N, K, 3], or a pair of
-            them, [N, 1, 3] and [N, K - 1, 3], which saves joining what is trained apart.
+        colors: [N, D] or [C, N, D] channels; with `sh_degree` spherical harmonics, [N, K, 3] or [C, N, K, 3],
+            or a pair of them, [N, 1, 3] and [N, K - 1, 3], which saves joining what is trained apart.
         viewmats: world to camera, [C, 4, 4].
         Ks: intrinsics in pixels, [C, 3, 3].
         width, height: image size in pixels.

@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from hqgs.base.stages import OnStage, silent
+from hqgs.base.state import own_state
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin.scene import HEIGHT, WIDTH, embedded_scene
 from hqgs.scene.constants import TEST_EVERY
@@ -32,6 +33,7 @@ from hqgs.scene.tags import by_tags, check_tag_size
 from hqgs.scene.upright import as_asked, direction_of, with_up
 
 
+@own_state(grad=True)
 def load(
     path: str | Path,
     *,
@@ -216,6 +218,7 @@ def pictures(
     return load(path, downscale=downscale, longest=longest, test_every=every, points=False)
 
 
+@own_state(grad=True)
 def degrade(scene: Scene, kind: str, *, seed: int = 0) -> Scene:
     """The scene with degraded training photos (float32, 1 is white); held-out ones stay as they are.
 

@@ -18,6 +18,7 @@ from hqgs import _rust
 from hqgs._rust import EPS2D, FAR_PLANE
 from hqgs.base.evenly import evenly
 from hqgs.base.files import atomic_path
+from hqgs.base.state import own_state
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.formats.arrays import curve_order
 from hqgs.model.formats.turned import matrices
@@ -41,6 +42,7 @@ Picture = NDArray[np.uint8]
 OnFrame = Callable[[int, int], None]
 
 
+@own_state(grad=False)
 def render_frames(
     gaussians: Gaussians,
     cameras: Sequence[Camera],

@@ -3,7 +3,7 @@
 use super::{Arrays, Frame};
 use crate::threads;
 use crate::{
-    arrays::{Array, CountsByName, Scalar, by_dtype, of_type, optional_of_shape},
+    arrays::{Array, CountsByName, Scalar, by_dtype, join, of_type, optional_of_shape},
     error::BindingResult,
 };
 use hqgs::internals::{
@@ -128,12 +128,12 @@ fn project_backward_as<'py, T: Scalar>(
         harmonics_rest: wanted[6],
         camera: wanted[7],
     };
-    let (sums, viewmats) = py.detach(|| {
+    let (sums, viewmats, mut of_each) = py.detach(|| {
         threads::install(|| -> Result<_, Error> {
             let mut sums: Option<GaussianGrads<T>> = None;
-            let mut viewmats = Vec::with_capacity(16 * c);
+            let (mut viewmats, mut of_each) = (Vec::with_capacity(16 * c), Vec::new());
             for (i, camera) in frame.cameras.iter().enumerate() {
-                let grads = project::backward(
+                let mut grads = project::backward(
                     &gaussians,
                     shadings[i].as_ref(),
                     camera,
@@ -143,15 +143,21 @@ fn project_backward_as<'py, T: Scalar>(
                     asked,
                 )?;
                 viewmats.extend(grads.camera.viewmat(camera));
+                if frame.harmonics_of_each {
+                    of_each.push(mem::take(&mut grads.harmonics));
+                }
                 match &mut sums {
                     None => sums = Some(grads),
                     Some(sums) => add(sums, grads),
                 }
             }
-            Ok((sums, viewmats))
+            Ok((sums, viewmats, of_each))
         })
     })??;
     let mut grads = sums.ok_or_else(|| Error::new("viewmats", "there is no camera"))?;
+    if frame.harmonics_of_each {
+        grads.harmonics = join(&mut of_each, |harmonics| harmonics)?;
+    }
     let counts: CountsByName = grads.counts.entries().collect();
     let mut arrays = arrays_of(&mut grads);
     let [a, b, c, d, e, f, g] =

@@ -200,18 +200,24 @@ impl<'py, T: Scalar> Shades<'py, T> {
         sh_degree: Option<usize>,
     ) -> BindingResult<impl Fn(usize) -> Colors<'a, T> + Sync + use<'a, T>> {
         let harmonics = sh_degree
-            .map(|degree| harmonics(&self.colors, self.rest.as_ref(), n, degree))
+            .map(|degree| harmonics(&self.colors, self.rest.as_ref(), n, cameras, degree))
             .transpose()?;
         let (data, channels) = match harmonics {
-            Some(_) => (&[][..], 0),
+            Some(harmonics) => (harmonics.coefficients, 0),
             None => channels_of(&self.colors, n, cameras)?,
         };
-        Ok(move |i| {
-            harmonics.map_or_else(
-                || Colors::Channels(of_camera(data, i, n * channels), channels),
-                Colors::Harmonics,
-            )
+        Ok(move |i| match harmonics {
+            None => Colors::Channels(of_camera(data, i, n * channels), channels),
+            Some(harmonics) => Colors::Harmonics(Harmonics {
+                coefficients: of_camera(data, i, n * harmonics.rows().0),
+                ..harmonics
+            }),
         })
+    }
+
+    /// Whether each camera has harmonics of its own.
+    fn of_each(&self) -> bool {
+        matches!(*self.colors.shape(), [c, _, _, _] if c > 1)
     }
 }
 
@@ -293,6 +299,7 @@ fn project_as<'py, T: Scalar>(
         projections: outs.into_iter().map(|out| out.projection).collect(),
         options,
         n,
+        harmonics_of_each: shades.of_each(),
     }));
     let out = (
         frame,
@@ -310,10 +317,12 @@ fn harmonics<'a, T: Scalar>(
     colors: &'a Array<'_, T>,
     rest: Option<&'a Array<'_, T>>,
     n: usize,
+    cameras: usize,
     degree: usize,
 ) -> BindingResult<Harmonics<'a, T>> {
     let count = |name: &str, array: &Array<'_, T>| match *array.shape() {
         [given, k, 3] if given == n => Ok(k),
+        [c, given, k, 3] if (c, given) == (cameras, n) && rest.is_none() => Ok(k),
         ref shape => {
             let expected = format!("[{n}, K, 3]");
             Err(Error::shape(name, expected, format!("{shape:?}")))
@@ -336,7 +345,11 @@ fn harmonics<'a, T: Scalar>(
         stored,
         degree,
     };
-    harmonics
+    let first = Harmonics {
+        coefficients: of_camera(harmonics.coefficients, 0, n * harmonics.rows().0),
+        ..harmonics
+    };
+    first
         .check(n)
         .map_err(|e| e.renamed("degree", "sh_degree"))?;
     Ok(harmonics)

@@ -35,6 +35,8 @@ pub(crate) struct Projections {
     pub(crate) projections: Vec<Projection>,
     options: RenderOptions,
     pub(crate) n: usize,
+    /// Whether each camera has harmonics of its own.
+    harmonics_of_each: bool,
     /// Of each camera; a `Vec<Option<Shading<T>>>`.
     shadings: AnyType,
     counts: Counts,
