@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import sys
 from itertools import pairwise
 
@@ -26,14 +25,13 @@ from benchmarks.scenes.shake import (
     shake_kernel,
 )  # fmt: skip
 from benchmarks.scenes.video import film
-from benchmarks.scenes.walkers import Figure
 from hqgs.photos.degrade import degrade_image, degrade_sequence
 from hqgs.photos.formation import formation
 from hqgs.photos.formula import KINDS, OWN, parse_degradation, parse_formation
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.pixels import as_floats
 
-NEW = ("shake", "exposure", "chat", "phone", "video", "video265", "crowd")
+NEW = ("shake", "exposure", "chat", "phone", "video", "video265")
 NOT_TOLD = tuple(kind for kind in NEW if kind not in OWN)
 
 
@@ -222,30 +220,6 @@ def test_the_default_of_chat_is_half_of_the_longest_side() -> None:
 
 
 # --- phone
-
-
-def test_walkers_are_where_they_say() -> None:
-    """Pixels whose middle lies within a limb are painted, and none but them and their neighbours."""
-    clean = np.full((45, 60, 3), 0.5, np.float32)
-    counts = []
-    for seed in range(24):
-        result = degrade_image(clean, parse_degradation("crowd:2"), np.random.default_rng(seed))
-        (record,) = result.records
-        counts.append(len(record["walkers"]))
-        met = np.zeros((45, 60), bool)
-        for who in record["walkers"]:
-            place = [who[name] for name in ("x", "foot", "height")]
-            looks = Figure(**{name: who[name] for name in Figure._fields})
-            for limb in looks.limbs():
-                points = np.linspace(limb.a, limb.b, 50) * place[2] * 45 + [place[0] * 60, place[1] * 45]
-                y, x = np.mgrid[:45, :60] + 0.5
-                near = np.hypot(x[..., None] - points[:, 0], y[..., None] - points[:, 1]).min(-1)
-                met |= near < limb.radius * place[2] * 45
-        changed = (result.image != clean).any(-1)
-        assert (changed >= met).all()
-        assert not changed[np.logical_not(ndimage.binary_dilation(met, np.ones((3, 3))))].any()
-        assert json.loads(json.dumps(record)) == record
-    assert all(count > 3 for count in np.bincount(counts, minlength=3))
 
 
 def test_the_mosaic_is_rggb() -> None:
@@ -450,10 +424,10 @@ def test_bad_text_is_refused(text: str, message: str) -> None:
 def test_defaults() -> None:
     text = "+".join(NEW)
     assert str(parse_degradation(text).for_width(504)) == (
-        "shake:12+exposure:1+chat:252+phone:4+video:36+video265:36+crowd:3"
+        "shake:12+exposure:1+chat:252+phone:4+video:36+video265:36"
     )
     assert str(parse_degradation(text).for_width(252, 504)) == (
-        "shake:6+exposure:1+chat:252+phone:4+video:36+video265:36+crowd:3"
+        "shake:6+exposure:1+chat:252+phone:4+video:36+video265:36"
     )
     assert str(parse_degradation("some:shake").for_width(252)) == "some:shake:6"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -10,14 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from benchmarks.scenes import wild
-from benchmarks.scenes.crowd import Walker, draw_walkers
 from benchmarks.scenes.exposure import Exposure, path_viewmats, shaken, spread, still, through_lens
 from benchmarks.scenes.shake import path_points
 from benchmarks.scenes.sparse import TABLE, sparse_cameras, sparse_room
-from benchmarks.scenes.walkers import draw_figure
 from benchmarks.scenes.wild import DISTANCE, TRUE_KINDS, PhotoTruth, parse_true_kind, wild_room
 from hqgs.scene.builtin import scene, shading
 from hqgs.scene.builtin.scene import embedded_cameras, surface_points
@@ -219,7 +215,7 @@ def test_a_wild_room(kind: str, quick: list[int], tmp_path: Path) -> None:
         assert view.image.dtype == np.uint8
         name, _ = parse_true_kind(kind, 24)
         truth = room.truth[view.name]
-        assert (view.image != clean.image).any() == (name != "true-crowd" or bool(truth.walkers))
+        assert (view.image != clean.image).any()
         if view in room.scene.train[::4]:
             again = wild.taken(name, view.camera, truth)
             np.testing.assert_array_equal(view.image, again)  # the truth is what made the photo
@@ -260,37 +256,6 @@ def test_the_truth_of_each_kind() -> None:
         assert all((truth.gains == 1).all() == same_gains for truth in drawn)
 
 
-def test_walkers_cover_what_is_theirs_alone() -> None:
-    """A figure on a near wall of one's own making: the photo changes where rays meet its limbs."""
-    camera = small_camera(5)
-    walker = Walker(0.1, 1.9, 25.0, 2.5, draw_figure(np.random.default_rng(3)))
-    photo = wild.taken("true-crowd", camera, PhotoTruth(walkers=(walker,)))
-    y, x = np.mgrid[:54, :72] + 0.5
-    K, R = camera.K, camera.viewmat[:3, :3]
-    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1) @ R
-    met = np.zeros((54, 72), bool)
-    for limb in walker.surfaces():  # the discriminant of a sphere, in the limb's own frame
-        o = (camera.center - np.array(limb.center)) @ limb.rotation / limb.shape.half
-        d = rays @ limb.rotation / np.array(limb.shape.half)
-        b = (d * o).sum(-1)
-        met |= b * b > (d * d).sum(-1) * (o @ o - 1)
-    changed = (photo != render_view(camera)).any(-1)
-    assert 0.1 < met.mean() < 0.5
-    assert not changed[np.logical_not(ndimage.binary_dilation(met))].any()
-    assert changed[ndimage.binary_erosion(met)].mean() > 0.99
-    heads = np.array([limb.surfaces()[5].center for limb in (walker, walker._replace(height=2.0))])
-    assert heads[1, 1] - heads[0, 1] == pytest.approx(0.5 * 0.91)  # they stand on the floor
-
-
-def test_so_many_walkers() -> None:
-    rng = np.random.default_rng(0)
-    drawn = [draw_walkers(rng, 3) for _ in range(400)]
-    assert all(70 < count < 130 for count in np.bincount([len(one) for one in drawn]))
-    assert all(1.7 <= w.z <= 2.1 or 4.8 <= w.z <= 7.0 for one in drawn for w in one)
-    record = PhotoTruth(walkers=drawn[0] or drawn[1]).record("true-crowd")
-    assert json.loads(json.dumps(record)) == record
-
-
 def test_bad_kinds_are_refused() -> None:
     with pytest.raises(ValueError, match="unknown kind 'fog'; the room has: true-shake, true-defocus, "):
         wild_room("fog")
@@ -300,8 +265,8 @@ def test_bad_kinds_are_refused() -> None:
         wild_room("true-defocus:x")
     with pytest.raises(ValueError, match="seed is -1"):
         wild_room("true-shake", seed=-1)
-    with pytest.raises(ValueError, match=r"true-crowd is 1\.5, wanted the most walkers in a photo, 1\.\.9"):
-        wild_room("true-crowd:1.5")
+    with pytest.raises(ValueError, match=r"true-devices is 2\.5, wanted cameras that took turns, 2\.\.12"):
+        wild_room("true-devices:2.5")
     assert parse_true_kind("true-shake", 252) == ("true-shake", 6.0)
     assert parse_true_kind("true-exposure", 252) == ("true-exposure", 1)
 

@@ -1,4 +1,4 @@
-"""More kinds of degradation: what a hand, a camera, a messenger, a phone and an encoder do, and passers-by.
+"""More kinds of degradation: what a hand, a camera, a messenger, a phone and an encoder do.
 
 Importing this module adds them to those that hqgs makes:
 
@@ -6,16 +6,15 @@ Importing this module adds them to those that hqgs makes:
 |---|---|---|
 | `shake[:PX]` | a curved path of its own in each photo, in linear light | `shake.py` |
 | `exposure[:EV]` | gain and white balance of its own in each photo, in linear light | here |
-| `crowd[:N]` | 0 to N people walk through each photo | `walkers.py` |
 | `chat[:SIDE]` | a messenger: shrunk, JPEG, enlarged | here |
 | `phone[:EV]` | a phone in low light: mosaic, noise, its processing, JPEG | `phone.py` |
 | `video[:CRF]`, `video265[:CRF]` | H.264 or H.265 over all photos, sorted by name | `video.py` |
 
 Without a value, shake takes 12 px for a width of 504 px and scales with it, chat half of the longest side,
-exposure 1, crowd 3, phone 4, videos 36.
+exposure 1, phone 4, videos 36.
 
 Records hold of a shake "extent" and "length" of the path in px, and its four knots, "path"; of an exposure
-the "gains" of red, green and blue; of a crowd "walkers", each with place and looks; of a chat "size" of the
+the "gains" of red, green and blue; of a chat "size" of the
 small photo and "quality"; of a phone "electrons" of white; of a video "frame", its type, and "bytes".
 """
 
@@ -30,7 +29,6 @@ from numpy.typing import NDArray
 from benchmarks.scenes.phone import FULL_WELL, phone_jpeg
 from benchmarks.scenes.shake import draw_path, draw_strength, path_length, shake_kernel
 from benchmarks.scenes.video import film
-from benchmarks.scenes.walkers import walk_in
 from hqgs.photos.degrade import FILES, FILMS, OPERATORS, Own, Record, convolve
 from hqgs.photos.formula import KINDS, NOT_MADE, Kind
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
@@ -95,11 +93,6 @@ def _exposure(image: Float32, stops: float, rng: np.random.Generator) -> Own:
     return expose(image, gains), {"gains": gains.tolist()}
 
 
-def _crowd(image: Float32, most: float, rng: np.random.Generator) -> Own:
-    photo, walkers = walk_in(image, int(most), rng)
-    return photo, {"walkers": walkers}
-
-
 def _chat(image: Float32, side: float, rng: np.random.Generator) -> Own:
     quality = int(rng.integers(CHAT_QUALITIES[0], CHAT_QUALITIES[1] + 1))
     height, width = _chat_size(image.shape[0], image.shape[1], int(side))
@@ -121,10 +114,9 @@ KINDS |= {
         8, 10000, "the longest side in px", "SIDE", integer=True, at_504=252, formation=False, longest=True
     ),
     "phone": Kind(0, 12, "stops of light that are missing", "EV", default=4, formation=False, file=True),
-    "crowd": Kind(1, 99, "the most walkers in a photo", "N", integer=True, default=3, formation=False),
     "video265": replace(KINDS["video"], formation=False, own=None),
 }
-OPERATORS |= {"shake": _shake, "exposure": _exposure, "crowd": _crowd, "chat": _chat}
+OPERATORS |= {"shake": _shake, "exposure": _exposure, "chat": _chat}
 FILES |= {"phone": _phone}
 FILMS |= {kind: _film(kind) for kind in ("video", "video265")}
 for made in ("shake", "exposure", "video"):

@@ -29,7 +29,7 @@ def room(name: str | Path, cache: Path | None = None, downscale: float = 1.0, se
     "embedded": `embedded_scene`; "sparse": few photos from far apart (`sparse_room`); "beyond[:N]": N
     photos (12), judged between and beyond their cameras (`beyond_room`); "true-panorama": faces of panoramas
     of 1008 px (`panorama_room`); "true-shake[:PX]", "true-defocus[:R]", "true-exposure[:EV]",
-    "true-devices[:N]", "true-crowd[:N]": training photos that cameras have truly taken so, held-out ones
+    "true-devices[:N]": training photos that cameras have truly taken so, held-out ones
     clean (`wild_room`, with `seed`). `cache` keeps what was made. ValueError for an unknown name or a value
     out of range.
     """

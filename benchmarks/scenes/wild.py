@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.scenes.crowd import Walker, draw_walkers
 from benchmarks.scenes.devices import Device, draw_devices
 from benchmarks.scenes.exposure import Exposure, shaken, still, through_lens
 from benchmarks.scenes.kinds import draw_gains
@@ -28,7 +27,6 @@ TRUE_KINDS = {
     "true-defocus": Kind(0.5, 20, "the largest radius in px of a point at infinity", at_504=4.0),
     "true-exposure": Kind(0.01, 4, "the most stops to either side", default=1),
     "true-devices": Kind(2, 12, "cameras that took turns", integer=True, default=4),
-    "true-crowd": Kind(1, 9, "the most walkers in a photo", integer=True, default=3),
 }
 DISTANCE = FOCUS[2]  # at which translations and lenses have the stated effect, world units
 TURNS, MOVES = 0.75, 0.25  # shares of a path's extent: turns up, down and sideways; each other freedom
@@ -50,7 +48,6 @@ class PhotoTruth(NamedTuple):
     aperture: float = 0.0  # radius of the lens, world units
     focus: float = math.inf  # depth in focus, world units
     gains: Floats = np.ones(3)  # of red, green and blue, in linear light
-    walkers: tuple[Walker, ...] = ()
     device: Device | None = None
     samples: int = len(STILL)  # rays a pixel
 
@@ -65,8 +62,6 @@ class PhotoTruth(NamedTuple):
             facts["gains"] = self.gains.tolist()
         if self.device is not None:
             facts["device"] = self.device.record()
-        if self.walkers:
-            facts["walkers"] = [walker.record() for walker in self.walkers]
         return facts
 
 
@@ -103,8 +98,6 @@ def wild_room(
       its own (`draw_devices`), each photo with gains as `true-exposure:0.5`. The means of the responses, and
       of the logarithm of what gains and lenses make of light, are 0, as no photo can tell them. Views tell
       which camera took them (`View.device`).
-    - `true-crowd[:N]` (3): 0 to N figures walk through each photo (`draw_walkers`); where they are, and
-      nowhere else, it differs from the clean one.
 
     All is averaged in linear light; the camera's curve (`render_exposure`) comes last, then 8 bits. Each
     photo has a generator of its own from the seed and its place among all names. Points and poses are those
@@ -182,8 +175,7 @@ def exposure(kind: str, camera: Camera, truth: PhotoTruth) -> Exposure:
 
 def taken(kind: str, camera: Camera, truth: PhotoTruth) -> NDArray[np.uint8]:
     """The photo that the truth stands for."""
-    passing = [surface for walker in truth.walkers for surface in walker.surfaces()]
-    return render_exposure(exposure(kind, camera, truth), truth.gains, passing=passing, device=truth.device)
+    return render_exposure(exposure(kind, camera, truth), truth.gains, device=truth.device)
 
 
 def _of_devices(
@@ -204,8 +196,6 @@ def _draw(kind: str, value: float, camera: Camera, rng: np.random.Generator) -> 
         return PhotoTruth(gains=draw_gains(rng, value))
     if kind == "true-devices":
         return PhotoTruth(gains=draw_gains(rng, DEVICE_STOPS))
-    if kind == "true-crowd":
-        return PhotoTruth(walkers=draw_walkers(rng, int(value)))
     strength, focal = value * draw_strength(rng), camera.K[0, 0]
     if kind == "true-defocus":
         aperture = strength * DISTANCE / focal

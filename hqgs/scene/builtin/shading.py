@@ -1,6 +1,6 @@
 """Light, and the public renderers: `render_view` and `render_exposure` (photos), `render_depth`.
 
-The benchmarks make photos as life makes them by it: by moving cameras, lenses, devices, with walkers.
+The benchmarks make photos as life makes them by it: by moving cameras, lenses and devices.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -76,15 +76,13 @@ def render_exposure(
     exposure: Exposure,
     gains: NDArray[np.float64] | None = None,
     threads: int | None = None,
-    passing: Sequence[Surface] = (),
     device: Device | None = None,
 ) -> NDArray[np.uint8]:
     """Photo of the embedded scene, [H, W, 3] sRGB: the mean of an exposure's samples in linear light.
 
     `gains` [3] of red, green and blue are applied to the light, before the camera's curve, which is the same
-    in all photos: it rolls off the highlights and encodes sRGB. `passing`: what stands in the room beside
-    its own. `device`: whose lens darkens the light, and whose response follows the curve. `threads` as in
-    `render_view`.
+    in all photos: it rolls off the highlights and encodes sRGB. `device`: whose lens darkens the light, and
+    whose response follows the curve. `threads` as in `render_view`.
     """
     width, height = exposure.size
     image = np.empty((height, width, 3), np.uint8)
@@ -103,7 +101,7 @@ def render_exposure(
             values = device.respond(values)
         image[tile.rows, tile.cols] = (values * 255 + 0.5).astype(np.uint8)
 
-    _each_tile(exposure, np.float32, work, threads, passing)
+    _each_tile(exposure, np.float32, work, threads)
     return image
 
 
@@ -201,13 +199,7 @@ def _rays(
     return (ox, oy, oz), [R[0, k] * a + R[1, k] * b + R[2, k] for k in range(3)]
 
 
-def _each_tile(
-    exposure: Exposure,
-    dtype: type,
-    work: Callable[[_Tile], None],
-    threads: int | None,
-    passing: Sequence[Surface] = (),
-) -> None:
+def _each_tile(exposure: Exposure, dtype: type, work: Callable[[_Tile], None], threads: int | None) -> None:
     """Run `work` on fixed tiles that cover the picture; the tiles do not depend on the threads."""
     width, height = exposure.size
     if width < 1 or height < 1:
@@ -219,8 +211,6 @@ def _each_tile(
         raise ValueError(f"threads must be at least 1, got {threads}")
 
     scene = studio()
-    if passing:
-        scene = replace(scene, surfaces=(*scene.surfaces, *passing))
 
     def job(corner: tuple[int, int]) -> None:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # rays parallel to a side
