@@ -173,7 +173,7 @@ def test_a_resumed_run_learns_the_looks_that_paid(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(prepare, "tried_looks", lambda *of: tries.append(None) or looks)
     monkeypatch.setattr(Inspector, "diagnose", lambda *of: found_of("exposure", "vignetting"))
     scene = tiny_scene(6, num_points=10)
-    config = run_config(iterations=2, method="hqgs", leave_out="weight")
+    config = run_config(iterations=2, method="hqgs", leave_out="growth")
     for iterations in (2, 4):
         trainer = Trainer(scene, replace(config, iterations=iterations), tries=not file.exists())
         if file.exists():
