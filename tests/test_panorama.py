@@ -149,6 +149,41 @@ def test_a_panorama_is_read_as_the_faces_of_a_cube(tmp_path: Path, monkeypatch: 
     assert np.median(off(half.train[0])) < 8
 
 
+@pytest.mark.parametrize("floor", [0.0, 0.3])
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_turntable_before_a_graded_backdrop_is_flat(floor: float, suffix: str, tmp_path: Path) -> None:
+    """Its photos are 2:1, end as they begin, and are plain above and below: as a panorama is."""
+    rng = np.random.default_rng(0)
+    rows, columns = np.mgrid[:128, :256] / 128
+    backdrop = 60 + 120 * rows + 40 * (rows > 1 - floor)
+    for k in range(12):
+        thing = gaussian_filter(rng.normal(size=(128, 256)), 2.0)
+        inside = (columns - 1) ** 2 + (rows - 0.5) ** 2 < 0.1
+        grey = np.where(inside, 120 + 400 * thing, backdrop) + rng.normal(0, 1, backdrop.shape)
+        Image.fromarray(np.rint(grey.clip(0, 255)).astype(np.uint8)).convert("RGB").save(
+            tmp_path / f"{k}{suffix}"
+        )
+    found = bare_photos(tmp_path, 1)
+    assert found is not None
+    photos = readable(found)
+    assert not photos.around
+    assert len(photos.names) == 12
+
+
+def test_panoramas_by_what_they_show_are_called_so_and_how_to_refuse_it(tmp_path: Path) -> None:
+    write_walk(tmp_path, 5, 512)
+    found = bare_photos(tmp_path, 1)
+    assert found is not None
+    photos = readable(found)
+    assert photos.around
+    (said,) = [note for note in photos.notes if "by what they show" in note]
+    assert said.startswith("5 photos are taken for panoramas of 360 x 180 degrees")
+    for file in tmp_path.iterdir():  # as the note says
+        with Image.open(file) as photo:
+            photo.crop((0, 0, 512, 255)).save(file)
+    assert not readable(found).around
+
+
 def test_no_seam_where_a_panorama_ends(tmp_path: Path) -> None:
     """Its first and its last column meet in the middle of the face behind."""
     width = 360

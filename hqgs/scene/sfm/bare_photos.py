@@ -255,6 +255,11 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
         )
         names = [name for name in names if name not in set(aside)]
         looked, tags = {name: looked[name] for name in names}, {name: tags[name] for name in names}
+    if sphere and (untold := [name for name in names if not tags[name].panorama]):
+        notes.append(
+            f"{len(untold)} photos are taken for panoramas of 360 x 180 degrees by what they show, no file "
+            f"says it ({some(untold)}): if they are flat, cut a row off each, so that it is not 2:1"
+        )
     if not film or sphere:
         notes.insert(0, understood([*tags.values()], names, len(twice), sphere))
         told = [
