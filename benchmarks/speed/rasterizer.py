@@ -15,7 +15,6 @@ import hqgs
 from benchmarks.patches import COMPOSITE, CRATE
 from benchmarks.speed.inputs import LEAVES, RasterInputs
 from benchmarks.speed.timing import Seconds, StageClock, interleaved, warmed, whole
-from hqgs.base.threads import one_torch_thread
 
 STAGES = list(CRATE.values())
 BIN = "bin"  # what the tile lists take of "bin and composite"
@@ -24,8 +23,8 @@ LIMIT_NS = 0.65 + 1.05  # of one core, for a pair that blends: forward, backward
 
 
 class RasterPass:
-    """`hqgs.rasterization` with harmonics of degree 3 and its backward pass, timed; all gradients but the
-    camera's. The same numbers in any `dtype`."""
+    """`hqgs.rasterization` at its defaults with harmonics of degree 3, and its backward pass, timed; all
+    gradients but the camera's. torch has the threads that it has. The same numbers in any `dtype`."""
 
     def __init__(self, inputs: RasterInputs, dtype: torch.dtype = torch.float32) -> None:
         tensors = (torch.from_numpy(getattr(inputs, name)) for name in LEAVES)
@@ -33,7 +32,6 @@ class RasterPass:
         viewmat, K = (torch.from_numpy(m[None]).float() for m in (inputs.viewmat, inputs.K))
         self.arguments: dict[str, Any] = dict(zip((*LEAVES[:4], "colors"), self.leaves, strict=True))
         self.arguments |= {"viewmats": viewmat, "Ks": K, "width": inputs.width, "height": inputs.height}
-        self.arguments["packed"] = False
         self.arguments |= {"backgrounds": torch.from_numpy(inputs.background[None]).to(dtype), "sh_degree": 3}
         self.v_image = torch.from_numpy(inputs.v_image[None]).to(dtype)
         self.work = (0, 0, 0)  # of the last pass: pairs, blocks, blocks with a change
@@ -48,7 +46,7 @@ class RasterPass:
 
     def __call__(self) -> Seconds:
         clock = StageClock(keep=CRATE[COMPOSITE])
-        with one_torch_thread(), clock.watching(CRATE):
+        with clock.watching(CRATE):
             seconds = clock.seconds(self.run, STAGES)
         self.clear()
         composites = [composite for composite, *_ in clock.kept]  # which the crate counts and times itself

@@ -19,6 +19,7 @@ from benchmarks.speed.inputs import RasterInputs, fitted, make_inputs
 from benchmarks.speed.rasterizer import BIN, RasterPass, measure
 from benchmarks.speed.timing import (
     Seconds,
+    busy_core,
     expected_ratio,
     interleaved,
     median_ratio,
@@ -31,7 +32,7 @@ from hqgs.training.config import METHODS, PAPER, HQGSConfig, check_method
 from hqgs.training.trainer import Trainer
 
 DATA = read_toml(Path(__file__).with_name("speed.toml"))
-PARTS = ("rasterizer", "step", "formations", "threads", "scaling", "memory")
+PARTS = ("rasterizer", "busy", "step", "formations", "threads", "scaling", "memory")
 SHOWN = {
     "part": ("", ""),
     "case": ("case", ""),
@@ -68,6 +69,22 @@ class Speed:
 
     def rasterizer(self) -> Rows:
         return measure(self.inputs, self.repeats)
+
+    def busy(self) -> Rows:
+        """The same beside a process that takes a core; `ratio`: of the time without."""
+        cases = {f"{len(x):,}": RasterPass(x) for x in self.inputs}
+        jobs = {(name, False): warmed(case) for name, case in cases.items()}
+        jobs |= {(name, True): warmed(case, busy_core) for name, case in cases.items()}
+        measured = interleaved(jobs, self.repeats)
+        return [
+            {
+                "case": f"{name}, a core busy",
+                **whole(rounds),
+                "ratio": median_ratio(rounds, measured[name, False]),
+            }
+            for (name, busy), rounds in measured.items()
+            if busy
+        ]
 
     def step(self, trainers: dict[str, Trainer] | None = None) -> Rows:
         return measure_steps(trainers or self.trainers, self.repeats)

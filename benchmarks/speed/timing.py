@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import subprocess
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
@@ -60,6 +62,16 @@ def using_threads(count: int) -> Iterator[None]:
         yield
     finally:
         hqgs.set_num_threads(before)
+
+
+@contextmanager
+def busy_core() -> Iterator[None]:
+    """Inside it another process takes a core."""
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
+        try:
+            yield
+        finally:
+            process.kill()
 
 
 def quartiles(values: Any) -> list[float]:
