@@ -115,6 +115,19 @@ def test_links_count_once_and_loops_end(tmp_path: Path) -> None:
     assert found == ["a/1.png", "b/2.png", "x/3.png"]
 
 
+def test_photos_alone_behind_links_count_once(tmp_path: Path) -> None:
+    truth, root = make_truth(5), tmp_path / "scene"
+    write_photos(truth, tmp_path / "card" / "walk")
+    root.mkdir()
+    (root / "a").symlink_to(tmp_path / "card" / "walk")
+    (root / "b").symlink_to(tmp_path / "card" / "walk")
+    (tmp_path / "card" / "walk" / "back").symlink_to(root)
+    found = bare_photos(root, 1)
+    assert found is not None
+    assert found.names == truth.names
+    assert not any("copies" in note or "not used" in note for note in found.notes)
+
+
 @pytest.mark.parametrize("root", ["/home/u/scene/images/", "C:\\scans\\images\\", "file:///srv/x/images/"])
 def test_absolute_paths_of_another_machine(tmp_path: Path, root: str) -> None:
     """In a model whose folder of photos is a link."""

@@ -113,7 +113,8 @@ def test_the_film_is_taken_not_its_cover_thumbnail_or_proxy(tmp_path: Path) -> N
     plain = written(
         tmp_path / "b.mkv", [(cover, "mjpeg", 0), (small, "libx264", 1), (pictures(20), "libx264", 0)]
     )
-    for path in (covered, plain):
+    shown = written(tmp_path / "c.mp4", [(cover * 2, "mjpeg", 0), (pictures(20), "libx264", 0)])
+    for path in (covered, plain, shown):
         frames, note = frames_of(path, tmp_path)
         assert len(frames) == 4
         assert frames[0].shape == (HEIGHT, WIDTH, 3)

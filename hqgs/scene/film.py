@@ -191,11 +191,11 @@ def _best_stream(film: Any, path: Path, told: dict[str, None]) -> Any:
     streams = film.streams.video
     if not streams:
         raise ValueError(f"{path} holds no pictures, only sound")
-    ranks = []
+    ranks, most = [], max(stream.frames for stream in streams)
     for stream in streams:
         flags = int(getattr(stream, "disposition", 0))
-        single = stream.frames == 1 or (stream.frames == 0 and stream.codec_context.name in _PICTURES)
-        ranks.append((not flags & aside, not single, stream.width * stream.height, flags & 1))
+        few = 4 * stream.frames < most if stream.frames else stream.codec_context.name in _PICTURES
+        ranks.append((not flags & aside, not few, stream.width * stream.height, flags & 1))
     best = streams[max(range(len(ranks)), key=lambda k: (ranks[k], -k))]
     if len(streams) > 1:
         told[f"of its {len(streams)} streams of pictures, that of {best.width} x {best.height} px"] = None

@@ -300,6 +300,7 @@ def ups(exif: Sequence[Exif]) -> np.ndarray:
 def _photos_below(folder: Path, deepest: bool = False) -> dict[str, list[str]]:
     """The photos in the folders below, by their paths: those of the first level that has any; or of all."""
     level, found = [folder], dict[str, list[str]]()
+    seen = {folder.resolve(), *folder.resolve().parents}  # links lead there again
     for _ in range(FOLDERS_DEEP):
         inner = (p for place in level for p in place.iterdir() if p.is_dir())
         level = sorted(
@@ -308,6 +309,9 @@ def _photos_below(folder: Path, deepest: bool = False) -> dict[str, list[str]]:
             if not (is_mask_folder(p.name) or p.name == KEPT or p.name[0] == "." or is_run(p))
         )
         level = [p for p in level if os.access(p, os.R_OK | os.X_OK)]  # not a card's lost+found
+        once = {p.resolve(): p for p in sorted(level, key=lambda p: (not p.is_symlink(), p))}
+        level = sorted(p for real, p in once.items() if real not in seen)
+        seen |= once.keys()
         found |= {p.relative_to(folder).as_posix(): names for p in level if (names := _photos_in(p))}
         if found and not deepest:
             break
