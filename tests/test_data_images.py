@@ -167,18 +167,6 @@ def test_order_is_kept_over_many_photos(tmp_path: Path) -> None:
         np.testing.assert_array_equal(a.image, b.image)
 
 
-@pytest.mark.parametrize(
-    "name", ["mask/view_00.png", "Masks/view_00.png.PNG", "masks/view_00_mask.jpg", "masks/mask_view_00.png"]
-)
-def test_masks_by_the_names_that_people_give_them(tmp_path: Path, name: str) -> None:
-    write_colmap(make_truth(3), tmp_path)
-    (tmp_path / name).parent.mkdir()
-    Image.fromarray(np.repeat([[0, 255]], 18, 1).repeat(48, 0).T.astype(np.uint8)).save(tmp_path / name)
-    mask = load_scene(tmp_path, test_every=0).train[0].mask
-    assert mask is not None
-    assert mask.mean() == 0.5
-
-
 @pytest.mark.parametrize("size", [(1, 1), (6, 40), (7, 7)])
 def test_a_glance_at_the_smallest_jpeg(tmp_path: Path, size: tuple[int, int]) -> None:
     Image.new("L", size, 128).save(tmp_path / "a.jpg")

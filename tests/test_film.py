@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
 import sys
 from fractions import Fraction
 from pathlib import Path
@@ -96,23 +95,6 @@ def test_a_variable_rate_counts_by_time(tmp_path: Path) -> None:
     folder, _ = film_frames(encoded(tmp_path / "phone.mp4", images, 20, times), tmp_path / "frames", 6)
     chosen = [times[int(path.stem)] for path in sorted(folder.glob("*.jpg"))]
     assert [int(6 * time / (times[-1] + 1000 / RATE)) for time in chosen] == [0, 1, 2, 3, 4, 5]
-
-
-def test_a_film_held_upright_is_shown_upright(tmp_path: Path) -> None:
-    """Phones store the matrix of the picture's turn (ISO 14496-12, tkhd): (x, y) goes to (-y, x), y down."""
-    picture = np.zeros((96, 128, 3), np.uint8)
-    picture[:, 96:, 0] = 250  # red on the right as stored, below as shown
-    path = encoded(tmp_path / "portrait.mp4", [picture] * 4, 12)
-    content = bytearray(path.read_bytes())
-    at = content.index(b"tkhd") + 44
-    assert struct.unpack_from(">9i", content, at) == (1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
-    struct.pack_into(">9i", content, at, 0, 1 << 16, 0, -(1 << 16), 0, 0, 96 << 16, 0, 1 << 30)
-    path.write_bytes(content)
-    folder, _ = film_frames(path, tmp_path / "frames", 3)
-    for frame in folder.glob("*.jpg"):
-        shown = np.asarray(Image.open(frame)).astype(int)
-        assert shown.shape == (128, 96, 3)
-        assert shown[100:, :, 0].min() > 200 > 60 > shown[:90, :, 0].max()
 
 
 @pytest.mark.parametrize(

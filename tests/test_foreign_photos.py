@@ -96,19 +96,6 @@ def test_masks_of_zero_and_one_labels_and_alpha(tmp_path: Path) -> None:
     np.testing.assert_array_equal(decode_mask(tmp_path / "alpha.png", 96, 72), true)
 
 
-@pytest.mark.parametrize("mask", ["view_01.jpg", "view_01.png.jpg", "view_01.PNG", "view_01.png.png"])
-def test_masks_with_other_suffixes_are_found(tmp_path: Path, mask: str) -> None:
-    write_colmap(make_truth(3), tmp_path)
-    (tmp_path / "masks").mkdir()
-    values = np.zeros((36, 48), np.uint8)
-    values[:, 24:] = 255
-    kind = "jpeg" if mask.endswith("jpg") else "png"
-    Image.fromarray(values).save(tmp_path / "masks" / mask, kind)
-    view = load_scene(tmp_path, test_every=0).train[1]
-    assert view.mask is not None
-    assert abs(view.mask.mean() - 0.5) < 0.02
-
-
 @pytest.mark.parametrize(("orientation", "turn"), [(0, 0), (1, 0), (6, 1), (8, 3), (9, 0), (255, 0)])
 def test_orientations_that_there_are_none_of(tmp_path: Path, orientation: int, turn: int) -> None:
     exif = Image.Exif()

@@ -97,6 +97,15 @@ def test_a_mask_belongs_to_one_photo(tmp_path: Path, photo: str, mask: str, foun
     assert masks == ({photo: tmp_path / mask} if found else {})
 
 
+@pytest.mark.parametrize("place", ["walk/masks", "Masks", "walk"])
+def test_masks_lie_beside_the_photos_or_above(tmp_path: Path, place: str) -> None:
+    (tmp_path / place).mkdir(parents=True)
+    (tmp_path / "walk").mkdir(exist_ok=True)
+    for name in ("walk/0.png", f"{place}/0_mask.PNG"):
+        Image.new("L", (8, 8)).save(tmp_path / name)
+    assert masks_of(tmp_path, tmp_path / "walk", ["0.png"]) == {"0.png": tmp_path / place / "0_mask.PNG"}
+
+
 def test_masks_of_photos_that_are_called_alike(tmp_path: Path) -> None:
     names = ["cam0/1.jpg", "cam1/1.jpg", "2.jpg", "2.png"]
     for name in ("masks/1.png", "masks/2.jpg.png", "masks/2.png.png"):

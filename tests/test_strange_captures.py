@@ -102,18 +102,6 @@ def test_links_to_photos_that_were_moved_are_made_anew(cards: Scene, tmp_path: P
     assert [path.name for path in keep.iterdir()] == [kept.name]
 
 
-def test_masks_lie_beside_the_photos_or_above(cards: Scene, tmp_path: Path) -> None:  # noqa: F811
-    inner = tmp_path / "walk"
-    (inner / "masks").mkdir(parents=True)
-    for k, view in enumerate([*cards.train, *cards.test]):
-        Image.fromarray(view.image.astype(np.uint8)).save(inner / f"{k}.png")
-        mask = np.full(view.image.shape[:2], 255, np.uint8)
-        mask[:20] = 0
-        Image.fromarray(mask).save(inner / "masks" / f"{k}.png")
-    scene = load_scene(tmp_path)
-    assert all(view.mask is not None and not view.mask.all() for view in [*scene.train, *scene.test])
-
-
 def test_faces_of_a_photo_are_one_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     truth, told, asked = make_truth(count=12), dict[Path, Exif](), list[Path]()
     rng = np.random.default_rng(0)

@@ -93,7 +93,7 @@ class Glance:
     size: tuple[int, int]  # width and height as stored
     format: str  # Pillow's name of what the file holds
     small: NDArray[np.uint8]  # [GRID, GRID], its brightness: nearly the same for the same picture
-    colors: Colors | None  # as `colors_of` has them
+    colors: Colors | None = None  # as `colors_of` has them
 
 
 def glance(path: Path) -> Glance:
