@@ -10,91 +10,65 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hqgs._rust import get_num_threads, set_num_threads
-    from hqgs.base.files import FolderBusyError
-    from hqgs.diagnosis.scene import Diagnosis
-    from hqgs.diagnosis.scene import diagnose_scene as diagnose
-    from hqgs.model.gaussians import Gaussians
-    from hqgs.model.gsplat_kernels import gsplat_on_cpu
-    from hqgs.model.orbit import orbit
-    from hqgs.model.rasterization import RasterizationMeta, rasterization
-    from hqgs.photos.pixels import picture
-    from hqgs.pipeline import Run, train
-    from hqgs.scene.camera_files import load_cameras
-    from hqgs.scene.paths import camera_path, look_at
-    from hqgs.scene.scene import Camera, Scene, View
-    from hqgs.scene.source import degrade, load
-    from hqgs.show.frames import render_frames
-    from hqgs.training.config import TrainConfig
-    from hqgs.training.progress import Progress
-    from hqgs.training.trainer import TrainingError
+    from hqgs._rust import get_num_threads as get_num_threads
+    from hqgs._rust import set_num_threads as set_num_threads
+    from hqgs.base.files import FolderBusyError as FolderBusyError
+    from hqgs.diagnosis.scene import Diagnosis as Diagnosis
+    from hqgs.diagnosis.scene import diagnose_scene
+    from hqgs.model.gaussians import Gaussians as Gaussians
+    from hqgs.model.gsplat_kernels import gsplat_on_cpu as gsplat_on_cpu
+    from hqgs.model.orbit import orbit as orbit
+    from hqgs.model.rasterization import RasterizationMeta as RasterizationMeta
+    from hqgs.model.rasterization import rasterization as rasterization
+    from hqgs.photos.pixels import picture as picture
+    from hqgs.pipeline import Run as Run
+    from hqgs.pipeline import train as train
+    from hqgs.scene.camera_files import load_cameras as load_cameras
+    from hqgs.scene.paths import camera_path as camera_path
+    from hqgs.scene.paths import look_at as look_at
+    from hqgs.scene.scene import Camera as Camera
+    from hqgs.scene.scene import Scene as Scene
+    from hqgs.scene.scene import View as View
+    from hqgs.scene.source import degrade as degrade
+    from hqgs.scene.source import load as load
+    from hqgs.show.frames import render_frames as render_frames
+    from hqgs.training.config import TrainConfig as TrainConfig
+    from hqgs.training.progress import Progress as Progress
+    from hqgs.training.trainer import TrainingError as TrainingError
+
+    diagnose = diagnose_scene
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "Camera",
-    "Diagnosis",
-    "FolderBusyError",
-    "Gaussians",
-    "Progress",
-    "RasterizationMeta",
-    "Run",
-    "Scene",
-    "TrainConfig",
-    "TrainingError",
-    "View",
-    "__version__",
-    "camera_path",
-    "degrade",
-    "diagnose",
-    "get_num_threads",
-    "gsplat_on_cpu",
-    "load",
-    "load_cameras",
-    "look_at",
-    "orbit",
-    "picture",
-    "rasterization",
-    "render_frames",
-    "set_num_threads",
-    "train",
-]
-
 # Each name is loaded when it is first used: torch, COLMAP and the rest take seconds.
 _HOMES = {
-    "Camera": "hqgs.scene.scene",
-    "Diagnosis": "hqgs.diagnosis.scene",
-    "FolderBusyError": "hqgs.base.files",
-    "Gaussians": "hqgs.model.gaussians",
-    "Progress": "hqgs.training.progress",
-    "RasterizationMeta": "hqgs.model.rasterization",
-    "Run": "hqgs.pipeline",
-    "Scene": "hqgs.scene.scene",
-    "TrainConfig": "hqgs.training.config",
-    "TrainingError": "hqgs.training.trainer",
-    "View": "hqgs.scene.scene",
-    "camera_path": "hqgs.scene.paths",
-    "degrade": "hqgs.scene.source",
-    "diagnose": "hqgs.diagnosis.scene:diagnose_scene",
-    "get_num_threads": "hqgs._rust",
-    "gsplat_on_cpu": "hqgs.model.gsplat_kernels",
-    "load": "hqgs.scene.source",
-    "load_cameras": "hqgs.scene.camera_files",
-    "look_at": "hqgs.scene.paths",
-    "orbit": "hqgs.model.orbit",
-    "picture": "hqgs.photos.pixels",
-    "rasterization": "hqgs.model.rasterization",
-    "render_frames": "hqgs.show.frames",
-    "set_num_threads": "hqgs._rust",
-    "train": "hqgs.pipeline",
+    "hqgs._rust": "get_num_threads set_num_threads",
+    "hqgs.base.files": "FolderBusyError",
+    "hqgs.diagnosis.scene": "Diagnosis diagnose:diagnose_scene",
+    "hqgs.model.gaussians": "Gaussians",
+    "hqgs.model.gsplat_kernels": "gsplat_on_cpu",
+    "hqgs.model.orbit": "orbit",
+    "hqgs.model.rasterization": "RasterizationMeta rasterization",
+    "hqgs.photos.pixels": "picture",
+    "hqgs.pipeline": "Run train",
+    "hqgs.scene.camera_files": "load_cameras",
+    "hqgs.scene.paths": "camera_path look_at",
+    "hqgs.scene.scene": "Camera Scene View",
+    "hqgs.scene.source": "degrade load",
+    "hqgs.show.frames": "render_frames",
+    "hqgs.training.config": "TrainConfig",
+    "hqgs.training.progress": "Progress",
+    "hqgs.training.trainer": "TrainingError",
 }
+_NAMES = {name.partition(":")[0]: (home, name) for home, names in _HOMES.items() for name in names.split()}
+__all__ = ["__version__", *sorted(_NAMES)]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> object:
-    if name not in _HOMES:
+    if name not in _NAMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, _, own_name = _HOMES[name].partition(":")
-    value = getattr(import_module(module), own_name or name)
+    home, written = _NAMES[name]
+    value = getattr(import_module(home), written.rpartition(":")[2])
     globals()[name] = value
     return value
 

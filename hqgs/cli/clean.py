@@ -12,9 +12,8 @@ import tyro
 from hqgs.base.options import Factor, Number
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.judge import check_source
-from hqgs.cli.out_folder import check_above
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import measured_scene, tell_read
+from hqgs.cli.scenes import check_above, measured_scene, tell_read
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians

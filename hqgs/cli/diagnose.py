@@ -11,8 +11,7 @@ import tyro
 import hqgs
 from hqgs.base.files import write_json
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.out_folder import check_out_file
-from hqgs.cli.scenes import Photos, ready
+from hqgs.cli.scenes import Photos, check_out_file, ready
 from hqgs.training.config import longest_side
 
 

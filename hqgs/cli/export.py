@@ -11,9 +11,8 @@ import tyro
 from hqgs.base.options import Factor, Flag, values
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.out_folder import check_above
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Photos, load, measured_scene, ready, tell_read
+from hqgs.cli.scenes import Photos, check_above, load, measured_scene, ready, tell_read
 from hqgs.model.formats.files import FORMATS, WRITTEN, format_of, scene_file
 from hqgs.scene.names import is_room
 from hqgs.show.export_options import ExportOptions

@@ -13,9 +13,8 @@ from hqgs import __version__
 from hqgs.base.files import CONFIG, write_json
 from hqgs.base.options import Color, Factor, Number
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.out_folder import check_out_folder
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import check_background, measured_scene, ready
+from hqgs.cli.scenes import check_background, check_out_folder, measured_scene, ready
 from hqgs.evaluation.judge_words import told
 from hqgs.evaluation.verdict import judged_by
 

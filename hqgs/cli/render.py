@@ -14,8 +14,7 @@ import tyro
 from hqgs.base.options import Color, Factor, Number, Size, Unsaid, Vector, choice
 from hqgs.base.text import some
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.out_folder import check_above
-from hqgs.cli.scenes import check_background, tell_read
+from hqgs.cli.scenes import check_above, check_background, tell_read
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,16 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 import hqgs
-from hqgs.base.files import CHECKPOINT, PAGE, PLY
+from hqgs.base.files import CHECKPOINT, PAGE, PLY, lock_folder
 from hqgs.base.left_out import format_left_out
 from hqgs.base.options import Flag, Folder, Number, Unsaid
-from hqgs.base.ranks import RankError, Ranks, joined
+from hqgs.base.ranks import RankError, Ranks, joined, was_restarted
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.out_folder import check_out
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, Times, TrainingScreen, duration
-from hqgs.cli.ranks import restarted, told_by_the_first
-from hqgs.cli.scenes import Photos, ready, tell_notes
+from hqgs.cli.scenes import Photos, check_out, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.evaluation.verdict import judged_by, overdone, told, verdict
@@ -151,6 +151,33 @@ def run(options: Train) -> int:
     if live is not None:
         live.stay() if done.finished else live.close()
     return code
+
+
+@contextmanager
+def told_by_the_first(ranks: Ranks) -> Iterator[None]:
+    """Nothing is shown but by the first rank; how a rank ends, each one tells."""
+    if ranks.first:
+        yield
+        return
+    with (
+        open(os.devnull, "w", encoding="utf-8") as nowhere,
+        redirect_stdout(nowhere),
+        redirect_stderr(nowhere),
+    ):
+        yield
+
+
+def restarted(out: Path, overwrite: bool, ranks: Ranks) -> bool:
+    """Whether torchrun has started the run in `out` again after a fault, so that it goes on.
+
+    With `overwrite` a first start removes the checkpoint there, or a restart would go on with the older run.
+    """
+    if was_restarted():
+        return True
+    if overwrite and ranks.count > 1 and ranks.first and out.is_dir():
+        with lock_folder(out):
+            (out / CHECKPOINT).unlink(missing_ok=True)
+    return False
 
 
 def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingScreen, TrainingScreen, float]:

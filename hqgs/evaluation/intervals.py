@@ -12,8 +12,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from hqgs.evaluation.constants import CONFIDENCE
 
 # The deviation of photos' values within a scene, its median over nine captures, and the deviation of its log
@@ -31,6 +29,7 @@ def half_width(values: Sequence[float | None], metric: str | None = None) -> flo
     known = [value for value in values if value is not None]
     if len(known) < max(2, len(values)):
         return None
+    import numpy as np  # here: the command line waits for neither
     from scipy.special import stdtrit
 
     quantile = float(stdtrit(len(known) - 1, (1 + CONFIDENCE) / 2))
@@ -41,6 +40,7 @@ def half_width(values: Sequence[float | None], metric: str | None = None) -> flo
 
 def _expected(usual: float, deviation: float, count: int) -> float:
     """Half the interval of a mean, of normal values whose log deviation is normal around that of `usual`."""
+    import numpy as np
     from scipy.special import erf
 
     away = np.linspace(-4, 4, 161)
@@ -73,6 +73,8 @@ def difference(one: Sequence[float | None], other: Sequence[float | None]) -> Di
     pairs = [(a, b) for a, b in zip(one, other, strict=True) if a is not None and b is not None]
     if not pairs or len(pairs) < len(one):
         return None
+
+    import numpy as np
 
     apart = [a - b for a, b in pairs]
     return Difference(float(np.mean(apart)), half_width(apart))
