@@ -40,17 +40,6 @@ def project(
     return arguments, _rust.project_forward(**arguments)
 
 
-def test_any_byte_of_a_mask_but_0_counts() -> None:
-    """As bool, the bytes 2..255 would be undefined behaviour."""
-    _, (frame, *_) = project()
-    some = np.random.default_rng(0).integers(0, 2, (1, 20, 36), dtype=np.uint8)
-    expected = _rust.blending_weights(frame, some, True)
-    assert (expected > 0).any()
-    assert not np.array_equal(expected, _rust.blending_weights(frame, None, True))
-    for byte in (2, 254, 255):
-        assert np.array_equal(_rust.blending_weights(frame, some * np.uint8(byte), True), expected)
-
-
 def test_a_composite_goes_back_through_its_own_frame() -> None:
     """Its tile lists belong to no other one: what is composited later changes nothing."""
     arguments, (frame, *_) = project(40)
@@ -428,9 +417,6 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
                 "composite": composite, "backgrounds": np.zeros((2, 3)), "v_image": np.zeros((2, 20, 36, 3)),
                 "v_alphas": np.zeros((2, 20, 36, 1)), "wanted": [True] * 4,
             },
-        ),
-        "blending_weights": (
-            _rust.blending_weights, {"frame": frame, "mask": np.ones((2, 20, 36), np.uint8), "double": True}
         ),
         "photometric": (
             _rust.photometric, {"render": pictures[0], "target": pictures[1], "mask": mask, **photo}

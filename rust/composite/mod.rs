@@ -4,12 +4,10 @@ mod backward;
 mod forward;
 mod gather;
 mod kernel;
-mod max_weights;
 mod picture;
 
 pub use backward::{CompositeCotangents, CompositeGrads, Wanted, backward};
 pub use forward::{Image, forward};
-pub use max_weights::max_weights;
 pub use picture::picture;
 
 use crate::{
@@ -177,22 +175,6 @@ mod tests {
             background: None,
         };
         let image = forward::<f32>(&projection, &[], 0, &camera, None).unwrap();
-        for (n, width, height) in [(20, 70, 45), (300, 90, 45), (300, 70, 90)] {
-            let (projection, _, camera) = binned(n, width, height);
-            let other = CompositeInput {
-                projection: &projection,
-                camera: &camera,
-                ..input
-            };
-            assert_eq!(max_weights(&other, None).unwrap_err().name(), "tiles");
-        }
-        let (projection, tiles, camera) = binned(300, 20, 20);
-        let other = CompositeInput {
-            projection: &projection,
-            tiles: &tiles,
-            camera: &camera,
-            background: None,
-        };
         let v = CompositeCotangents {
             image: &[],
             alphas: None,
@@ -200,6 +182,23 @@ mod tests {
         let wanted = Wanted {
             geometry: true,
             ..Wanted::default()
+        };
+        for (n, width, height) in [(20, 70, 45), (300, 90, 45), (300, 70, 90)] {
+            let (projection, _, camera) = binned(n, width, height);
+            let other = CompositeInput {
+                projection: &projection,
+                camera: &camera,
+                ..input
+            };
+            let error = backward(&other, &image.composited, &v, wanted).unwrap_err();
+            assert_eq!(error.name(), "tiles");
+        }
+        let (projection, tiles, camera) = binned(300, 20, 20);
+        let other = CompositeInput {
+            projection: &projection,
+            tiles: &tiles,
+            camera: &camera,
+            background: None,
         };
         let error = backward(&other, &image.composited, &v, wanted).unwrap_err();
         assert_eq!(error.name(), "composited");

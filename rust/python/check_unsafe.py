@@ -37,7 +37,7 @@ def rasterize(dtype: type, degree: int | None) -> None:
     look(*outputs, colors)
     colors, background = given if degree is None else colors.reshape(COUNT, 3), uniform(1, channels)
     composite, image, alphas = _rust.composite_forward(frame, colors, background, channels)
-    look(image, alphas, _rust.blending_weights(frame, None, dtype is np.float64))
+    look(image, alphas)
     v_image, v_alphas = uniform(1, HEIGHT, WIDTH, channels), uniform(1, HEIGHT, WIDTH, 1)
     grads = _rust.composite_backward(composite, background, v_image, v_alphas, [True] * 4)
     look(*grads[:-1])

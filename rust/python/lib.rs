@@ -5,7 +5,6 @@ mod arrays;
 mod composite;
 mod error;
 mod exposure;
-mod max_weights;
 mod pictures;
 mod project;
 mod stereo;
@@ -123,6 +122,5 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     training::register(m)?;
     pictures::register(m)?;
     exposure::register(m)?;
-    stereo::register(m)?;
-    max_weights::register(m)
+    stereo::register(m)
 }
