@@ -20,7 +20,9 @@ from test_spz import angles
 
 from hqgs.cli import main as cli
 from hqgs.model.constants import SH_C0
+from hqgs.model.formats.files import FORMATS as FORMATS_OF_FILES
 from hqgs.model.gaussians import Gaussians
+from hqgs.scene.names import SCENE_SUFFIXES
 from hqgs.scene.paths import look_at
 
 FORMATS = ("splat", "compressed.ply", "glb")
@@ -248,3 +250,8 @@ def test_gltf_that_is_not_read_is_named(tmp_path: Path, change: Any, message: st
     change_gltf(tmp_path / "a.glb", change)
     with pytest.raises(ValueError, match=rf"a\.glb.*{message}"):
         Gaussians.load(tmp_path / "a.glb")
+
+
+def test_names_that_are_told_from_photos_are_those_of_the_table() -> None:
+    ends = {f".{name.rpartition('.')[2]}" for name in FORMATS_OF_FILES} - {".json"}
+    assert set(SCENE_SUFFIXES) == ends

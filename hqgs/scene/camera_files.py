@@ -232,7 +232,7 @@ def save_path(
         if world is not None:
             camera = replace(camera, viewmat=world.viewmat_out(camera.viewmat))
         if by is not None:
-            camera = moved(camera, World(), np.linalg.inv(by))
+            camera = moved(camera, World(), np.asarray(np.linalg.inv(by), np.float64))
         pose = np.eye(4)
         pose[:3, :3] = camera.viewmat[:3, :3].T @ _FLIP
         pose[:3, 3] = camera.center

@@ -73,7 +73,7 @@ def in_data_frame(path: Path, arrays: Arrays) -> Arrays:
         if "applied_scale" in applied:
             there = there / _number(cameras, applied, "applied_scale")
     there[3] = 0, 0, 0, 1
-    back, world = np.linalg.inv(there), arrays.get("world", World())
+    back, world = np.asarray(np.linalg.inv(there), np.float64), arrays.get("world", World())
     if world.up is not None:
         x, y, z = back[:3, :3] @ world.up / np.linalg.norm(back[:3, :3] @ world.up)
         world = replace(world, up=(float(x), float(y), float(z)))
@@ -81,7 +81,8 @@ def in_data_frame(path: Path, arrays: Arrays) -> Arrays:
         f"in the frame of its photos' cameras, by {BESIDE}; camera paths that lie beside it are taken there"
     )
     turned = near_origin(placed(arrays, back, world), world)
-    return {**turned, "moved": back, "notes": [*arrays.get("notes", []), note]}
+    turned["moved"], turned["notes"] = back, [*arrays.get("notes", []), note]
+    return turned
 
 
 def _read(path: Path) -> dict[str, Any]:

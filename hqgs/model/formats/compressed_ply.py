@@ -36,6 +36,7 @@ from hqgs.model.formats.arrays import (
     writable,
 )
 from hqgs.model.formats.ply_comments import comments_of, told_by
+from hqgs.scene.world import World
 
 CHUNK = 256
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -79,7 +80,7 @@ def write_compressed_ply(path: Path, arrays: Arrays) -> int:
         levels = (np.floor((rest / 8 + 0.5) * 256) - turns).clip(0, 255).astype(np.uint8)
         names = [(f"f_rest_{k}", "u1") for k in range(count)]
         elements.append(PlyElement.describe(np.ascontiguousarray(levels).view(names)[:, 0], "sh"))
-    comments = comments_of({"antialiased": arrays.get("antialiased", False)})  # its frame is said beside it
+    comments = comments_of(World(), arrays.get("antialiased", False))  # its frame is said beside it
     with atomic_path(path) as tmp:
         PlyData(elements, byte_order="<", comments=comments).write(str(tmp))
     return left_out

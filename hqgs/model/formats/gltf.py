@@ -156,7 +156,8 @@ def read_gltf(path: Path) -> Arrays:
         parts = [placed(part, by, world) for part, by in zip(parts, maps, strict=True)]
     most = max(part["shN"].shape[1] for part in parts)
     for part in parts:
-        part["shN"] = np.pad(part["shN"], ((0, 0), (0, most - part["shN"].shape[1]), (0, 0)))
+        added = np.zeros((len(part["shN"]), most - part["shN"].shape[1], 3))
+        part["shN"] = np.concatenate([part["shN"], added], axis=1, dtype=np.float64)
     named = (*TENSORS, *(["errors"] if all("errors" in part for part in parts) else []))
     found = cast(Arrays, {name: np.concatenate([part[name] for part in parts]) for name in named})
     if said is None or not still:

@@ -89,7 +89,7 @@ def write_ply(path: Path, arrays: Arrays, *, full: bool = False) -> int:
     vertices = np.empty(int(finite.sum()), kinds)
     for k, name in enumerate(names):
         vertices[name] = means[finite, k] if name in _MEANS else rows[finite, k]
-    says = comments_of({**arrays, "world": world})
+    says = comments_of(world, arrays.get("antialiased", False))
     with atomic_path(path) as tmp:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=says).write(str(tmp))
     return int(n - finite.sum())

@@ -20,19 +20,18 @@ _ANTIALIASED = [f"{OURS} antialiased", "SplatRenderMode: mip"]  # the latter for
 
 # Comments of other programs.
 _MODE = re.compile(rf"(?:{OURS} )?(?:antialias\w*|train_flags|splat ?render ?mode)[\s:=]*(.*)")
-_MODES = dict.fromkeys(("0", "false", "no", "off", "none", "default", "classic"), False)
-_MODES |= dict.fromkeys(("", "1", "true", "yes", "on", "mip", "antialiased", "antialiasing"), True)
+_OFF: tuple[str, ...] = ("0", "false", "no", "off", "none", "default", "classic")
+_ON: tuple[str, ...] = ("", "1", "true", "yes", "on", "mip", "antialiased", "antialiasing")
 _UP = re.compile(r"(?:vertical|up)[ _-]?(?:axis|vector|direction)?[\s:=]+(.*)")
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _UNIT = re.compile(r"(?:\w+[ _-])?units?[\s:=]+(.*)")
 _TELLING = re.compile(r"unit|axis|axes|handed|coordinate|colou?r|gamma|offset|shift|origin|epsg|crs|kernel")
 
 
-def comments_of(told: Told) -> list[str]:
+def comments_of(world: World, antialiased: bool) -> list[str]:
     """What is written into a header."""
-    world = told.get("world", World())
     says = [f"{OURS} scene", *([f"{_WORLD}{json.dumps(world.json())}"] if world != World() else [])]
-    return says + (_ANTIALIASED if told.get("antialiased") else [])
+    return says + (_ANTIALIASED if antialiased else [])
 
 
 def told_by(comments: list[str]) -> Told:
@@ -48,8 +47,8 @@ def told_by(comments: list[str]) -> Told:
                 told["world"] = World.of_json(json.loads(comment.removeprefix(_WORLD)))
             except (ValueError, RecursionError) as error:
                 raise ValueError(f"its comment {comment!r:.80} is damaged: {error}") from error
-        elif (mode := _MODE.fullmatch(line)) and mode[1] in _MODES:
-            told["antialiased"] = _MODES[mode[1]]
+        elif (mode := _MODE.fullmatch(line)) and mode[1] in _OFF + _ON:
+            told["antialiased"] = mode[1] in _ON
         elif (axis := _UP.fullmatch(line)) and (up := _direction(axis[1])):
             if up != (0.0, -1.0, 0.0):  # that of a scene that says nothing
                 told["world"] = replace(world, up=up)

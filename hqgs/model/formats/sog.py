@@ -87,7 +87,7 @@ def encode_sog(g: Arrays, antialiased: bool) -> dict[str, bytes]:
         table[: len(sets)] = codes
         files["shN_centroids.webp"] = _webp(table.reshape(-1, 3), ACROSS * coefficients)
         files["shN_labels.webp"] = _webp(np.stack([labels % 256, labels // 256, 0 * labels], axis=1))
-        meta["shN"] = {"count": len(sets), "bands": _COEFFICIENTS.index(coefficients)}
+        meta["shN"] = dict[str, Any](count=len(sets), bands=_COEFFICIENTS.index(coefficients))
         meta["shN"]["codebook"] = book.tolist()
         meta["shN"]["files"] = ["shN_centroids.webp", "shN_labels.webp"]
     return {META: json.dumps(meta).encode()} | files

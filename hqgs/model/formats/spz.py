@@ -278,15 +278,11 @@ def _unpack_4(packed: bytes) -> tuple[int, int, int, int, int, list[Bytes]]:
     moved = table < HEADER_4.size if extended else table != HEADER_4.size or zeros.strip(b"\0")
     if count != len(wanted) or moved or place > len(packed):
         raise ValueError(f"the header promises {count} arrays at {table}, wanted {len(wanted)}")
-    found = []
-    for k, size in enumerate(sizes):
-        length = 0
-        if size:
-            length, promised = ENTRY.unpack_from(
-                packed, table + len([s for s in sizes[:k] if s]) * ENTRY.size
-            )
-            if promised != size or length > len(packed) - place:
-                raise _damaged(n, promised > size)
+    found, entries = list[Bytes](), ENTRY.iter_unpack(packed[table:place])
+    for size in sizes:
+        length, promised = next(entries) if size else (0, 0)
+        if promised != size or length > len(packed) - place:
+            raise _damaged(n, promised > size)
         data = _unframe(packed[place : place + length], size, n) if size else b""
         found.append(np.frombuffer(data, np.uint8))
         place += length
