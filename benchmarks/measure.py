@@ -16,8 +16,7 @@ from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.forward import Step
 from hqgs.training.frame import Frame
-from hqgs.training.length import fit_to_seconds
-from hqgs.training.trainer import Trainer
+from hqgs.training.trainer import Trainer, fit_to_seconds
 
 Run = dict[str, Any]  # plain JSON values
 MEASURED = {"psnr": psnr, "ssim": ssim, "haarpsi": haarpsi}  # at the moments of a run

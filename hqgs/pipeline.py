@@ -41,12 +41,11 @@ from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
 from hqgs.training.frame import Frame
-from hqgs.training.length import fit_to_seconds
 from hqgs.training.notes import learned_record, run_notes, run_pictures
 from hqgs.training.plan import essential
 from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values, plan_values
-from hqgs.training.trainer import Trainer
+from hqgs.training.trainer import Trainer, fit_to_seconds
 
 
 @dataclass(frozen=True)

@@ -179,7 +179,11 @@ def test_colmap_sees_large_photos_smaller_and_what_it_finds_is_at_their_stored_s
     model, rng = pycolmap.Reconstruction(), np.random.default_rng(0)
     model.add_camera_with_trivial_rig(camera)
     points = rng.uniform([-1, -1, 4], [1, 1, 6], (20, 3))
-    seen = [np.add(camera.img_from_cam(np.add(points, (k, 0, 0))), (0.3, -0.4)) for k in range(2)]
+    seen = []
+    for k in range(2):
+        pixels = camera.img_from_cam(np.add(points, (k, 0, 0)))
+        assert pixels is not None
+        seen.append(np.add(pixels, (0.3, -0.4)))
     for k, xy in enumerate(seen):
         image = pycolmap.Image(name=f"{k}", keypoints=xy, camera_id=1, image_id=k + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), [k, 0, 0]))

@@ -17,8 +17,7 @@ from hqgs.pipeline import open_run, train
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import OTHER, check_scene, load_checkpoint, save_checkpoint, scene_fingerprint
 from hqgs.training.config import DensifyConfig, run_config
-from hqgs.training.length import fit_to_seconds
-from hqgs.training.trainer import Trainer
+from hqgs.training.trainer import Trainer, fit_to_seconds
 
 
 @pytest.fixture(scope="module")

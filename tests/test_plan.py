@@ -105,17 +105,20 @@ def test_a_repeat_of_seconds_starts_from_as_many_points(tmp_path: Path) -> None:
     assert other.first_points > 1.9 * run.first_points
 
 
-def test_a_run_that_may_not_leave_out_photos_is_planned_as_before() -> None:
+def test_a_list_leaves_out_only_what_it_names() -> None:
+    """Beside that, a run is planned as by default."""
+
     def plan(items: str) -> RunPlan:
         return Prepared(
             textured_scene(8, 64), run_config(method="hqgs", formation="none", leave_out=items)
         ).plan()
 
-    all_of_it, some = plan("photos,growth"), plan("growth")
+    all_of_it, some = plan("photos,growth"), plan("growth,resolution")
     assert some.half_size_until == all_of_it.half_size_until > 0
     kept = [[row for row in p.rows if row.what != "left out at most"] for p in (some, all_of_it)]
     assert [(row.what, row.why) for row in kept[0]] == [(row.what, row.why) for row in kept[1]]
     assert not plan("photos").half_size_until
+    assert not plan("growth").half_size_until
 
 
 def test_a_rule_is_one_entry() -> None:

@@ -97,7 +97,7 @@ def test_harmonics_of_each_camera_are_those_of_a_camera_alone(batch: bool, packe
         assert torch.equal(images[k], image[0])
         (image[0] * weights[k]).sum().backward()
         assert torch.equal(colors.grad[k], own.grad)  # pyright: ignore
-        means += one.means.grad
+        means += one.means.grad  # pyright: ignore[reportOperatorIssue]
         torch.testing.assert_close(scene.viewmats.grad[k], one.viewmats.grad[k])  # pyright: ignore
     torch.testing.assert_close(scene.means.grad, means, rtol=1e-12, atol=1e-12)
 

@@ -11,14 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from hqgs.training.plan import PlanRow, StepSeconds
+from hqgs.training.plan import PlanRow
 from hqgs.training.schedule import CHECKS, REST, Decisions, Schedule
 from hqgs.training.state import TrainState
-
-if TYPE_CHECKING:
-    from hqgs.training.trainer import Trainer
 
 # dB and iterations: the run has stopped improving where held-back photos gain no more in so many.
 BETTER, PATIENCE = 0.05, 2_000
@@ -73,26 +69,3 @@ def by_the_clock(
     if iteration != at or not at < min(length, config.iterations) or length == decisions.length == most:
         return decisions
     return replace(decisions, length=length, turned=at)
-
-
-def fit_to_seconds(trainer: Trainer) -> None:
-    """Plan a run that has so many seconds anew, by the time that its first steps take, and let it begin.
-
-    Does nothing to a run without a number of seconds, or whose length is recorded. The trainer is a fresh
-    one; the steps leave nothing behind.
-    """
-    if trainer.asked.seconds is None or trainer.asked.turn is not None:
-        return
-    half = _timed(trainer, True) if trainer.plan.half_size_until else 0.0
-    half, full = trainer.ranks.tell([half, _timed(trainer, False)])[0]
-    trainer.begin(trainer.prepared.plan(StepSeconds(full, half)))
-
-
-def _timed(trainer: Trainer, half_size: bool) -> float:
-    """Mean seconds of a step's view at half or at full size."""
-    for _ in range(3):  # the first ones start threads and fill caches
-        trainer.step(half_size)
-    started, before = trainer.seconds, trainer.iteration
-    for _ in range(7):
-        trainer.step(half_size)
-    return (trainer.seconds - started) / (trainer.iteration - before)

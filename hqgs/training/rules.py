@@ -18,7 +18,15 @@ from hqgs.base.left_out import CORRECTION
 from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.photos.formula import ERRORS, FILM, LEARNED, LINEAR, NONE, Degradation, parse_formation, undegraded
-from hqgs.training.config import AUTO, FORMATION, ITEMS, DensifyConfig, TrainConfig, with_iterations
+from hqgs.training.config import (
+    AUTO,
+    AUTOMATIC,
+    FORMATION,
+    ITEMS,
+    DensifyConfig,
+    TrainConfig,
+    with_iterations,
+)
 from hqgs.training.methods.formed import noise_of
 from hqgs.training.methods.held_pixels import HELD_PIXELS
 from hqgs.training.methods.hqgs import KNEE
@@ -339,7 +347,8 @@ def starts_small(draft: Draft) -> bool:
     all over them, of which Gaussians may be left out."""
     items, facts = draft.settings.leave_out, draft.facts
     fits = facts.as_photographed and facts.shortest_side >= COARSE_FACTOR * SMALLEST_SIDE
-    return fits and ("resolution" in items or (draft.formed and draft.dense and "growth" in items))
+    automatic = set(AUTOMATIC) <= set(items)
+    return fits and ("resolution" in items or (draft.formed and draft.dense and automatic))
 
 
 def half_size_end(iterations: int) -> int:

@@ -32,7 +32,7 @@ from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, Guard, parameter_fault
 from hqgs.training.length import by_held_photos, by_the_clock
 from hqgs.training.methods.base import Method
 from hqgs.training.overfitting import decay_opacities
-from hqgs.training.plan import PlanRow, RunPlan, Tried, left_out_of
+from hqgs.training.plan import PlanRow, RunPlan, StepSeconds, Tried, left_out_of
 from hqgs.training.prepare import Prepared
 from hqgs.training.schedule import FINEST, Decisions, Schedule, StepPlan, learning_rates, on_the_way
 from hqgs.training.settings import config_values
@@ -348,3 +348,26 @@ class Trainer:
                 f"{found.step.view.name!r}"
             )
         return skipped < len(views)
+
+
+def fit_to_seconds(trainer: Trainer) -> None:
+    """Plan a run that has so many seconds anew, by the time that its first steps take, and let it begin.
+
+    Does nothing to a run without a number of seconds, or whose length is recorded. The trainer is a fresh
+    one; the steps leave nothing behind.
+    """
+    if trainer.asked.seconds is None or trainer.asked.turn is not None:
+        return
+    half = _timed(trainer, True) if trainer.plan.half_size_until else 0.0
+    half, full = trainer.ranks.tell([half, _timed(trainer, False)])[0]
+    trainer.begin(trainer.prepared.plan(StepSeconds(full, half)))
+
+
+def _timed(trainer: Trainer, half_size: bool) -> float:
+    """Mean seconds of a step's view at half or at full size."""
+    for _ in range(3):  # the first ones start threads and fill caches
+        trainer.step(half_size)
+    started, before = trainer.seconds, trainer.iteration
+    for _ in range(7):
+        trainer.step(half_size)
+    return (trainer.seconds - started) / (trainer.iteration - before)
