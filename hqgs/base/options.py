@@ -11,8 +11,8 @@ import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 Spec = PrimitiveConstructorSpec[Any]
-Unsaid = tyro.conf.arg(help_behavior_hint="")  # whose words tell the default
-KINDS = {int: "a whole number", float: "a number"}
+Unsaid: Any = tyro.conf.arg(help_behavior_hint="")  # whose words tell the default
+KINDS: dict[Any, str] = {int: "a whole number", float: "a number"}
 PLAIN = ConstructorRegistry()  # of how other numbers are read
 
 

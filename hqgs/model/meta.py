@@ -45,7 +45,8 @@ class Later:
     """A value of the meta data that is made when somebody asks for it."""
 
     def __init__(self, make: Callable[..., Tensor], *arguments: Any) -> None:
-        self.make, self.arguments = make, arguments
+        self.make: Callable[..., Tensor] = make
+        self.arguments: tuple[Any, ...] = arguments
 
 
 class Meta(dict[str, Any]):
@@ -106,10 +107,10 @@ class Pairs:
     """
 
     def __init__(self, radii: Sequence[Tensor]) -> None:
-        self.shape = radii[0].shape[:2]
+        self.shape: torch.Size = radii[0].shape[:2]
         self._seen = [as_array(of_scene).view(np.int64).ravel() for of_scene in radii]  # both radii at once
-        self.counts = [np.count_nonzero(seen) for seen in self._seen]
-        self.asked = False  # for `means2d`
+        self.counts: list[int] = [int(np.count_nonzero(seen)) for seen in self._seen]
+        self.asked: bool = False  # for `means2d`
 
     @cached_property
     def where(self) -> list[NDArray[np.intp]]:

@@ -77,7 +77,8 @@ GZIP = 31  # zlib's number for a stream with a gzip header
 LEVEL = 19  # of zstd: the best that asks no more memory of a reader
 MAX_RATIO = {2: 1032, 3: 1032, 4: 1 << 15}  # deflate and zstd pack no better: 128 KiB of one byte take 4
 
-Array, Bytes = NDArray[np.float64], NDArray[np.uint8]
+Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from hqgs.show.trust import LazyTrust
 
 STREAMED_SIDE = 2048  # px, at most
 MOVED = 0.02  # radians, and of the distance: a camera nearer than that to a photo's sees the same
-Picture, Floats = NDArray[np.uint8], NDArray[np.float32]
+Picture = NDArray[np.uint8]
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
