@@ -104,7 +104,10 @@ def read_colmap(root: Path, downscale: float) -> Capture:
             f"{len(models) + 1} COLMAP models: took the largest, {path.relative_to(root)}, with "
             f"{len(_registered(model))} photos (photos in the others: {others})"
         )
-    by_name = sorted((image.name, image.image_id) for image in _registered(model))
+    try:
+        by_name = sorted((image.name, image.image_id) for image in _registered(model))
+    except UnicodeDecodeError as e:  # of an image that the file's lines do not number alike: damaged
+        raise ValueError(f"{path}: the name of a photo cannot be read: {e}") from e
     if not by_name:
         raise ValueError(f"{path}: the COLMAP model has no registered photo")
     names = [name for name, _ in by_name]
