@@ -20,13 +20,10 @@ LONG = {  # gsplat's 26 arguments to check, and formats of many dialects
     "rasterization",
     "read_ply",
     "read_colmap",
-    "write_gltf",
-    "_read",
     "_camera",
     "sfm_scene",
     "readable",
     "load_scene",
-    "load",
 }
 
 
