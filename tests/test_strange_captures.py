@@ -13,7 +13,6 @@ from PIL import Image
 from test_film import encoded
 from test_front_door import looked_at
 from test_georeference import EAST, METRES, NORTH
-from test_next_photos import ring
 from test_sfm import cards  # noqa: F401
 from test_synthetic import depth_error, views_of
 
@@ -26,8 +25,7 @@ from hqgs.scene.film import film_frames, write_details
 from hqgs.scene.georeference import georeference
 from hqgs.scene.load import load_scene
 from hqgs.scene.named_split import listed_split, names_by_any
-from hqgs.scene.next_photos import next_photos
-from hqgs.scene.scene import Scene, SfmReport
+from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.failure import Outcome, why_doubtful, why_lost
 from hqgs.scene.sfm.likely import likely_pairs
 from hqgs.scene.sfm.run import Model
@@ -198,19 +196,6 @@ def test_a_film_that_does_not_tell_its_length(tmp_path: Path) -> None:
     numbers = sorted(int(path.stem) for path in folder.glob("*.jpg"))
     assert len(numbers) == 8
     assert max(np.diff(numbers)) < 11
-
-
-def test_panoramas_all_around_have_no_gaps() -> None:
-    scene = ring([*range(0, 360, 36)])
-    faces = [
-        replace(view, name=f"{view.name[:2]}.{face}.jpg", face=face) for view in scene.train for face in "ab"
-    ]
-    seen = {view.name: np.arange(60) for view in faces}
-    report = SfmReport(
-        10, [], 60, 3.0, 0.5, sure_px={f"{k:02}.jpg": 0.2 for k in range(10)} | {"07.jpg": 2.5}
-    )
-    (spot,) = next_photos(replace(scene, train=faces, seen=seen, sfm=report))
-    assert spot.told == "beside 07.jpg, whose place is sure to 2.5 px only"
 
 
 def test_a_mask_of_printing_inks_is_not_inverted(tmp_path: Path) -> None:

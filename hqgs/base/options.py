@@ -48,7 +48,6 @@ Number = Annotated["int | None", values("N", "a whole number", int), Unsaid]
 Seed = Annotated["int | None", values("S", "a whole number", int), Unsaid]
 Factor = Annotated["float | None", values("F", "a number", float), Unsaid]
 Seconds = Annotated["float | None", values("S", "a number", float), Unsaid]
-Metres = Annotated["float | None", values("METRES", "a number", float), Unsaid]
 Size = Annotated["tuple[int, int] | None", values("W H", "two whole numbers", int, int), Unsaid]
 Vector = Annotated[
     "tuple[float, float, float] | None", values("X Y Z", "three numbers", float, float, float), Unsaid

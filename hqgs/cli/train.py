@@ -189,8 +189,7 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
     elif ranks.local > 1:
         hqgs.set_num_threads(max(1, hqgs.get_num_threads() // ranks.local))
     ready(options.scene)
-    from hqgs.scene.next_photos import told_next  # here: they load torch
-    from hqgs.scene.source import load_as
+    from hqgs.scene.source import load_as  # here: it loads torch
 
     asked = ranks.tell(loading(options, config) if ranks.first else None)[0]
     with LoadingScreen() as screen:
@@ -225,8 +224,6 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
             on_stage=bar.stage,
             ranks=ranks,
         )
-    for line in told_next(scene) if ranks.first else []:
-        print(line)
     return done, live, screen, bar, loaded
 
 

@@ -2,13 +2,13 @@
 beside their use; what a built-in room is like is told beside it.
 
 Limits keep damaged files and short memory out; what decides between good inputs was tried on the captures of
-the tests and on fern, fox and horns; those of GPS, of tags and of where to photograph next were set by hand.
+the tests and on fern, fox and horns; those of GPS were set by hand.
 """
 
 # Every scene.
 TEST_EVERY = 8  # views: each 8th by name is held out (Mildenhall et al. 2019), where nothing else is said
-FEWEST_PHOTOS = 5  # with fewer none is compared with the others, nor is told where to photograph next
-ENOUGH_SHOW = 3  # photos: a point, tag or pixel that fewer show tells nothing
+FEWEST_PHOTOS = 5  # with fewer none is compared with the others
+ENOUGH_SHOW = 3  # photos: a point or pixel that fewer show tells nothing
 STRAY = 10.0  # median distances from the cameras' middle: one so far off says nothing of a scene's size
 PICTURE_MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
 
@@ -69,18 +69,3 @@ ROUNDING = 1e-9  # residuals and shares below it are none
 
 # GPS: what is asked of it before it tells a scale.
 GPS_LEAST = 4  # photos with a place
-
-# Printed tags.
-TAG_FITS = 2.0  # px: what the corners of a tag may be off a square, median; more, and two tags look the same
-TAG_BORDER = 0.125  # sides of white around a tag, least that is printed
-TAG_CELL = 16  # px of a cell of the drawing
-TAG_BLUR = 0.5  # px of the photo, sigma: what a pixel's square and a good lens do
-TAG_UNLIKE = 0.1  # of the contrast; what is farther off counts less
-TAG_SURE = 1e-3  # of a side: errors of the cameras, and of printing, are not less
-TAG_LEVEL = 20.0  # degrees between a tag's normal and the cameras' up: it lies on something level
-
-# Where to photograph next.
-GAP, WIDER = 20.0, 2.5  # degrees around the middle between neighbours, and times the usual: a gap
-LOOSE, LOOSER = 0.5, 3.0  # px that a pose may be off, and times the usual: a loose one
-ALONE, LONELIER = 0.5, 2.0  # of a photo's points that no third photo shows, and times the usual
-NEXT_MOST = 3  # places that are told

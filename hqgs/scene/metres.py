@@ -104,26 +104,11 @@ def in_metres(scene: Scene, distance: Distance) -> Scene:
     if not apart > 1e-6 * world.unit * scene.extent:
         raise ValueError(f"distance: {called[0]} and {called[1]} are in one place")
     metres = distance[2] / apart
-    said = f"{called[0]} and {called[1]} are {distance[2]:g} m apart, as --distance says"
-    return with_metres(scene, metres, said)
-
-
-def with_metres(
-    scene: Scene,
-    metres: float,
-    said: str,
-    error: float | None = None,
-    up: tuple[float, float, float] | None = None,
-) -> Scene:
-    """The same scene, written in metres, of which a unit of its files has so many, as `said` tells.
-
-    `error`: half of the 95 % interval, as a share; `up`: unit, where that is known better than by cameras.
-    """
-    world = scene.world
+    note = (
+        f"{called[0]} and {called[1]} are {distance[2]:g} m apart, as --distance says: what is written is in "
+        f"metres (1 unit of the cameras as they were found is {metres:.6g} m)"
+    )
     x, y, z = (metres * value for value in world.shift)
-    sure = "" if error is None else f", 95 % of it within {100 * error:.2g} %"
-    unit = f"1 unit of the cameras as they were found is {metres:.6g} m{sure}"
-    note = f"{said}: what is written is in metres ({unit})"
     place = None if world.place is None else world.place.of_units(metres)
-    made = World(world.unit * metres, (x, y, z), metres, error, up or world.up, place)
+    made = World(world.unit * metres, (x, y, z), metres, world.up, place)
     return replace(scene, world=made, notes=[*scene.notes, note])

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from hqgs.base.options import Apart, Factor, Flag, Metres, Number, Unsaid, Vector
+from hqgs.base.options import Apart, Factor, Flag, Number, Unsaid, Vector
 from hqgs.photos.formula import grammar
 from hqgs.scene.constants import TEST_EVERY
 
@@ -31,10 +31,8 @@ class PhotoOptions:
     """Frames to take from a film (two a second, 30 to 90)."""
     distance: Apart = None
     """Metres between the cameras of the photos A and B, or points x,y,z: the scene is written in metres."""
-    tag_size: Metres = None
-    """Width of printed tags (AprilTag 36h11, ArUco) in the scene: it is written in metres, upright."""
     up: Vector = None
-    """Where up is, in the frame of the photos' cameras (as upright edges, tags, GPS or EXIF tell it)."""
+    """Where up is, in the frame of the photos' cameras (as upright edges, GPS or EXIF tell it)."""
     degrade: Annotated[
         str | None,
         tyro.conf.arg(
@@ -68,5 +66,4 @@ class LoadOptions:
     coarse: bool | None = None
     frames: int | None = None
     distance: tuple[str | float, ...] | None = None
-    tag_size: float | None = None
     up: tuple[float, ...] | None = None

@@ -29,7 +29,6 @@ from hqgs.scene.photo_files import film_at
 from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
-from hqgs.scene.tags import by_tags, check_tag_size
 from hqgs.scene.upright import as_asked, direction_of, with_up
 
 
@@ -49,7 +48,6 @@ def load(
     coarse: bool | None = None,
     frames: int | None = None,
     distance: Sequence[str | float] | None = None,
-    tag_size: float | None = None,
     up: Sequence[float] | None = None,
     points: bool = True,
     on_stage: OnStage = silent,
@@ -78,9 +76,7 @@ def load(
         frames: how many of a film; None: two a second, 30 to 90.
         distance: (A, B, metres) between the cameras of two photos, or points "x,y,z" in the frame of the
             files: what is written is in metres then.
-        tag_size: metres; the width of the black square of printed tags (AprilTag 36h11, ArUco) that photos
-            show: what is written is in metres then, and upright where a tag lies (the extra `tags`).
-        up: x, y, z in the frame of the files; None: as photos, tags or GPS tell it.
+        up: x, y, z in the frame of the files; None: as photos or GPS tell it.
         points: where the files have cameras and no points, let COLMAP find points, and seek up. False, for a
             scene that is only looked at: random ones, and up as the photos were held.
         on_stage: hears what is being done, and how far it is.
@@ -107,7 +103,6 @@ def load(
         coarse=coarse,
         frames=frames,
         distance=None if distance is None else (*distance,),
-        tag_size=tag_size,
         up=None if up is None else (*up,),
     )
     scene = load_as(options, cache, points, on_stage)
@@ -123,8 +118,6 @@ def load_as(
     """The scene of these options, again where a run has kept them; `load` says the rest."""
     named = not Path(asked.path).is_absolute()
     apart = None if asked.distance is None else distance_of(asked.distance)
-    if asked.tag_size is not None:
-        check_tag_size(asked.tag_size, asked.distance)
     up = None if asked.up is None else direction_of(asked.up)
     degradation = parse_degradation(asked.degrade)
     if asked.restore is not None:
@@ -143,7 +136,6 @@ def load_as(
         scene = with_points(scene, models, on_stage)
         scene = scene if named or up is not None else with_up(scene)
     scene = scene if apart is None else in_metres(scene, apart)
-    scene = scene if asked.tag_size is None else by_tags(scene, asked.tag_size)
     scene = scene if up is None else as_asked(scene, up)
     kept_as = asdict(asked) | {"restore": asked.restore and str(Path(asked.restore).resolve())}
     return replace(scene, origin=json.loads(json.dumps(kept_as)))

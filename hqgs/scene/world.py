@@ -31,7 +31,6 @@ class World:
     unit: float = 1.0  # a power of two, times `metres`
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     metres: float | None = None  # that a unit of the files that were read has; None: nobody knows
-    error: float | None = None  # of `metres`, half of its 95 % interval, as a share; None: not known
     up: tuple[float, float, float] | None = None  # unit, in both frames; None: nothing told but the cameras
     place: Georeference | None = None  # on Earth, of what is written; None: nothing tells
 
@@ -85,7 +84,7 @@ class World:
 
     def json(self) -> dict[str, Any]:
         """As JSON values."""
-        known: dict[str, Any] = {"metres": self.metres, "error": self.error}
+        known: dict[str, Any] = {"metres": self.metres}
         known["up"] = None if self.up is None else [*self.up]
         known["place"] = None if self.place is None else asdict(self.place)
         told = {name: value for name, value in known.items() if value is not None}
@@ -96,17 +95,17 @@ class World:
         """What `json` gave. ValueError for anything else."""
         try:
             unit, shift = float(value["unit"]), tuple(float(x) for x in value["shift"])
-            metres, error = (float(value[k]) if k in value else None for k in ("metres", "error"))
+            metres = float(value["metres"]) if "metres" in value else None
             up = tuple(float(x) for x in value["up"]) if "up" in value else None
             place = Georeference(**value["place"]) if "place" in value else None
         except (TypeError, KeyError, ValueError, OverflowError) as error:
             raise ValueError(f"no unit and shift of a world: {value!r:.80}") from error
-        known = (metres is None or 0 < metres < math.inf) and (error is None or 0 <= error < math.inf)
+        known = metres is None or 0 < metres < math.inf
         known = known and (up is None or (len(up) == 3 and abs(math.hypot(*up) - 1) < 1e-6))
         if not (0 < unit < math.inf and known) or len(shift) != 3 or not all(map(math.isfinite, shift)):
             raise ValueError(f"no unit and shift of a world: {value!r:.80}")
         upward = None if up is None else (up[0], up[1], up[2])
-        return cls(unit, (shift[0], shift[1], shift[2]), metres, error, upward, place)
+        return cls(unit, (shift[0], shift[1], shift[2]), metres, upward, place)
 
     def __str__(self) -> str:
         words = []

@@ -27,7 +27,6 @@ from hqgs.evaluation.verdict import judged_by, told, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.scene.camera_files import load_cameras
-from hqgs.scene.next_photos import next_photos
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
 from hqgs.show.frames import trust_picture
@@ -104,7 +103,7 @@ def page_text(page: Page) -> str:
     ]
     measured_some = [h["views"] for h in history if "views" in h]
     learned = [learned_words(record) for record in report["learned"]]
-    diagnosis, spots, trust = page.diagnosis, next_photos(page.scene), None
+    diagnosis, trust = page.diagnosis, None
     if page.folder is not None and page.gaussians is not None and len(page.gaussians):
         trust = trust_part(page.folder, page.gaussians, report["iterations"])
     return filled(
@@ -134,8 +133,7 @@ def page_text(page: Page) -> str:
         left_out=[_left_out(item) for item in report["left_out"] if not _correction(item)],
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],
-        places=places_chart(page.scene, spots),
-        spots=[spot.told for spot in spots],
+        places=places_chart(page.scene),
         trust=trust,
         trust_pictures=[] if trust is None else [(what, jpeg(picture)) for what, picture in trust.pictures],
         sure=_sure(report),

@@ -56,11 +56,10 @@ def told_distance(a: Point, b: Point, world: World) -> str:
     """The distance of two points in words, with half of its 95 % interval."""
     length = world.unit * float(np.linalg.norm(a.at - b.at))
     error = 1.96 * world.unit * math.hypot(a.error, b.error)
-    error = math.hypot(error, length * (world.error or 0.0))
     digits = max(0, 1 - math.floor(math.log10(error))) if error > 0 else 3
-    unit, scale = ("m", "") if world.metres else ("units", "; nothing tells how long a unit is")
-    if world.metres and world.error is None:
-        scale = "; an error of the metre itself is not in it"
+    unit, scale = "units", "; nothing tells how long a unit is"
+    if world.metres:
+        unit, scale = "m", "; an error of the metre itself is not in it"
     return f"{length:.{digits}f} ± {error:.{digits}f} {unit} (95 %{scale})"
 
 
