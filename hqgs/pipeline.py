@@ -10,17 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import cast
 
 from hqgs import __version__
-from hqgs.base.files import (
-    CHECKPOINT,
-    CONFIG,
-    PAGE,
-    PLAN,
-    PLY,
-    atomic_path,
-    lock_folder,
-    remove_leftovers,
-    write_json,
-)
+from hqgs.base.files import CHECKPOINT, CONFIG, PAGE, PLAN, PLY, lock_folder, remove_leftovers, write_json
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import give_back_memory, peak_rss_mb
@@ -41,7 +31,7 @@ from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
 from hqgs.training.frame import Frame
-from hqgs.training.notes import learned_record, run_notes, run_pictures
+from hqgs.training.notes import learned_record, run_notes
 from hqgs.training.plan import essential
 from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values, plan_values
@@ -330,14 +320,10 @@ def _report(
         "config": asdict(config),
         "plan": rows,
     }
-    pictures = {} if out is None else run_pictures(trainer, learned)
-    for name, picture in pictures.items():
-        with atomic_path(cast(Path, out) / name) as tmp:
-            picture.save(tmp)
     if out is not None and config.seconds is not None:
         write_json(out / PLAN, plan_values(config, rows))
     result = RunResult(record, views)
     report = measure(result) if out is None else write_report(out, result)
     if out is not None:
-        write_page(out / PAGE, Page(report, scene, model, views, diagnosis, pictures, out))
+        write_page(out / PAGE, Page(report, scene, model, views, diagnosis, out))
     return report

@@ -114,7 +114,6 @@ def test_the_pictures_of_a_run_are_no_photos(tmp_path: Path) -> None:
         (tmp_path / run / "comparison").mkdir(parents=True)
         for name in files:
             (tmp_path / run / name).write_text("{}")
-        RED.save(tmp_path / run / "learned.png")
         RED.save(tmp_path / run / "comparison/a.png")
     found = bare_photos(tmp_path, 1)
     assert found is not None

@@ -20,7 +20,6 @@ from hqgs.scene.scene import Camera, Scene, View
 from hqgs.show.trust import (
     EMPTY,
     FLOOR,
-    GOOD,
     SHARE,
     Held,
     _ause,
@@ -60,9 +59,7 @@ def test_what_the_photos_show_otherwise_is_not_trusted(tmp_path: Path) -> None:
     scene = as_run(tmp_path, g, wrong)
     known = load_cameras(tmp_path)
     trust = learn_trust(g, known)
-    seen = trust.photos >= 2
-    assert float(trust.errors[wrong & seen].median()) > 5 * float(trust.errors[~wrong & seen].median())
-    assert int(trust.photos.max()) <= len(scene.train)
+    assert float(trust.errors[wrong].median()) > 5 * float(trust.errors[~wrong].median())
     for view in scene.test:
         error = 255 * (g.render(view.camera).clamp(0, 1) - torch.from_numpy(view.image) / 255).abs().mean(-1)
         bound = torch.from_numpy(trust.bound(view.camera))
@@ -71,9 +68,7 @@ def test_what_the_photos_show_otherwise_is_not_trusted(tmp_path: Path) -> None:
         assert float(bound[doubtful].mean()) > 2 * float(bound[error < 2].mean())
     measured = measure_trust(trust)
     assert measured is not None
-    assert measured.ause < 0.5 * measured.by_photos
-    assert measured.right > 0.95
-    assert 0.2 < measured.good < 0.8
+    assert measured.ause < 0.2
     assert "AUSE" in str(measured)
     none = replace(known, views=[view for view in known.views if not view.held_out])
     alone = learn_trust(g, none)
@@ -110,7 +105,7 @@ def test_what_a_mask_leaves_out_says_nothing_and_the_background_is_the_runs(tmp_
 
 def held(error: np.ndarray, carried: np.ndarray) -> Held:
     one = np.ones_like(error)
-    return Held("a", tiny_scene().test[0].camera, error, carried, one, one, one > 0)
+    return Held("a", tiny_scene().test[0].camera, error, carried, one, one > 0)
 
 
 def test_the_factor_keeps_nine_of_ten_pixels_below_their_bound() -> None:
@@ -123,21 +118,6 @@ def test_the_factor_keeps_nine_of_ten_pixels_below_their_bound() -> None:
     assert below(factor) == pytest.approx(SHARE, abs=0.001)
     assert calibrated([held(error, carried / 4)]) == pytest.approx(4 * factor, rel=1e-3)
     assert calibrated([]) == 1
-
-
-def test_the_factor_grows_until_what_is_called_good_is() -> None:
-    """8 % of the pixels are wrong by 60 levels, carried as if by none: 9 of 10 stay below all the same."""
-    error = np.full((100, 100), 0.12, np.float32)
-    error[:8], error[8:16] = 60 / 255, 0.001
-    carried = np.full_like(error, 0.1)
-    carried[:16] = 0.001
-    some = held(error, carried)
-    factor = calibrated([some])
-    bound = bound_of(np.float32(factor) * carried, some.alpha)
-    good = bound <= GOOD
-    assert (255 * error <= bound).mean() >= SHARE
-    assert factor > max(float(np.quantile(some.needed(), SHARE)), 0.0)
-    assert not good.any() or (255 * error <= GOOD)[good].mean() >= SHARE
 
 
 def test_each_gaussian_gets_its_weights_in_the_pixels() -> None:
@@ -165,7 +145,6 @@ def test_what_is_empty_has_the_error_of_nothing_known(tmp_path: Path) -> None:
     alpha = g.rasterize(away, torch.zeros(len(g), 1))[1]
     assert not alpha.any()
     np.testing.assert_allclose(trust.bound(away), 255 * EMPTY, rtol=1e-5)
-    assert trust.bound(away).min() > GOOD
 
 
 def test_threads_change_no_bit(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,8 +21,6 @@ import pytest
 import torch
 from browser import PATIENCE, chromium, wait
 from PIL import Image
-from scipy.spatial.transform import Rotation
-from test_ply import random_gaussians
 from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 import hqgs
@@ -38,8 +35,8 @@ from hqgs.show.frames import trust_picture
 from hqgs.show.trust import learn_trust
 from hqgs.show.viewer import guard
 from hqgs.show.viewer.guard import MAX_MESSAGE, allowed, start_server
-from hqgs.show.viewer.pictures import Pose, beside, browser_splats, same_view
-from hqgs.show.viewer.viewer import BROWSER, RASTERIZER, Viewer, _table
+from hqgs.show.viewer.pictures import Pose, beside, same_view
+from hqgs.show.viewer.viewer import Viewer, _table
 
 
 @pytest.fixture(scope="module")
@@ -293,52 +290,6 @@ def test_the_page_in_a_browser(folder: Path, capsys: pytest.CaptureFixture[str])
         assert np.abs(depth - picture).mean() > 15
         assert [text for text in wrong if "deprecated" not in text] == []
         assert str(viewer._numbers.content).endswith("| Gaussians | many |")
-
-
-def test_the_browser_draws_the_scene_itself(folder: Path) -> None:
-    """Its splats, without harmonics, look like the rasterizer's picture of the same."""
-    model = hqgs.Gaussians.load(folder)
-    plain = replace(model, shN=model.shN[:, :0])
-    with serving(folder) as viewer, chromium(600, 400) as (page, wrong):
-        page.goto(viewer.url)
-        wait(page, "document.querySelector('canvas') && document.body.innerText.includes('Show cameras')")
-        until(lambda: viewer.watched)
-        (client,) = viewer._clients.values()
-        time.sleep(2)
-        viewer._drawn.value = BROWSER
-        until(lambda: viewer._splats is not None)
-
-        def shown() -> np.ndarray:
-            return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float)[190:395, 5:270]
-
-        pose = Pose.of(client.handle.camera)
-        assert pose is not None
-        ours = expected(plain, pose.camera(400))[190:395, 5:270]
-        until(lambda: np.abs(shown() - ours).mean() < 12)
-        viewer.set_scene(model)  # as a run that trains does
-        assert viewer._splats is not None
-        viewer._drawn.value = RASTERIZER
-        until(lambda: viewer._splats is None)
-        known = ("deprecated", "computeBoundingSphere")  # of viser's own splats
-        assert [text for text in wrong if not any(word in text for word in known)] == []
-
-
-def test_splats_of_the_browser_are_the_gaussians() -> None:
-    g = random_gaussians(50, 3)
-    g.means[7, 1] = math.nan
-    g.quats[9] = math.inf
-    splats = browser_splats(g)
-    keep = torch.tensor([k for k in range(50) if k not in (7, 9)])
-    assert splats.centers.shape == (48, 3)
-    np.testing.assert_array_equal(splats.centers, g.means[keep].numpy())
-    w, *xyz = g.quats[keep].numpy().T.astype(np.float64)
-    R = Rotation.from_quat(np.stack([*xyz, w], 1)).as_matrix()
-    squares = np.exp(2 * g.scales[keep].numpy().astype(np.float64))
-    wanted = (R * squares[:, None]) @ R.swapaxes(1, 2)
-    np.testing.assert_allclose(splats.covariances, wanted, rtol=2e-4, atol=1e-5)
-    np.testing.assert_allclose(splats.opacities[:, 0], torch.sigmoid(g.opacities[keep]).numpy(), rtol=1e-6)
-    colors = np.clip(0.5 + 0.28209479 * g.sh0[keep, 0].numpy(), 0, 1)
-    np.testing.assert_allclose(splats.rgbs, colors, atol=1e-6)
 
 
 def test_the_page_says_what_the_report_says_of_a_photo(folder: Path) -> None:

@@ -21,10 +21,9 @@ SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writ
 CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"
 REPORT, PICTURES = "report.json", "comparison"
 CAMERAS, PHOTOS = "cameras.json", "photos"
-LEARNED = "learned.png"  # of the photos' cameras
 _LACKING = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM}
 PLAN = "plan.json"  # what a number of seconds came to
-RUN_FILES = (PLY, PAGE, REPORT, CAMERAS, LEARNED, PLAN, CONFIG, CHECKPOINT)  # what a run writes,
+RUN_FILES = (PLY, PAGE, REPORT, CAMERAS, PLAN, CONFIG, CHECKPOINT)  # what a run writes,
 RUN_FOLDERS = (PHOTOS, PICTURES)  # and where its pictures are
 
 

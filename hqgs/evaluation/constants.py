@@ -11,7 +11,6 @@ MOST_CAMERAS = 200  # evenly chosen, that stand for all: asked what they show; i
 FOG = 0.1  # of a pixel's colour from Gaussians that hang before the surface, and it lies behind fog
 
 # Pictures.
-AMPLIFICATION = 4  # times: so much larger differences and trajectories are drawn
+AMPLIFICATION = 4  # times: so much larger differences are drawn
 MASKED = 150, 158, 170  # difference where the mask leaves the photo out: no grey that a difference has
-SHEET_PHOTOS = 12  # on a sheet or in judge.html, at most
-TILE_SIDE = 260  # px, of a photo on a sheet
+SHEET_PHOTOS = 12  # in judge.html, at most

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 
@@ -37,16 +36,6 @@ def sheet(rows: Sequence[Sequence[tuple[str, NDArray[np.uint8]]]]) -> Image.Imag
             x, y = c * (width + GAP), r * (height + line + GAP)
             made.paste(strip, (x, y))
             made.paste(Image.fromarray(picture), (x, y + line))
-    return made
-
-
-def tiled(tiles: Sequence[Image.Image]) -> Image.Image:
-    """One or more small pictures in rows of four, on white."""
-    width, height = (max(getattr(tile, side) for tile in tiles) + GAP for side in ("width", "height"))
-    columns = min(4, len(tiles))
-    made = Image.new("RGB", (columns * width, math.ceil(len(tiles) / columns) * height), "white")
-    for k, tile in enumerate(tiles):
-        made.paste(tile, (k % columns * width, k // columns * height))
     return made
 
 

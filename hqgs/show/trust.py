@@ -34,8 +34,6 @@ EMPTY = 0.3  # error of what is behind everything
 FLOOR = 0.002  # keeps ratios of errors finite: half a level
 POWER, SCALE = 0.70, 0.52  # from what is carried to what SHARE of new pixels stay below: of three scenes
 SHARE = 0.9  # of the pixels: what a bound promises
-GOOD, LEAST_GOOD = 20.0, 0.005  # levels of 255: a pixel with such a bound is good; share of them that tells
-NONE_GOOD = 1.00001  # of the factor at which the surest pixel is still called good: none is
 CALIBRATORS = 40  # held-out photos that calibrate, at most
 Array = NDArray[np.float32]
 
@@ -49,7 +47,6 @@ class Held:
     error: Array  # mean of the channels, white is 1
     carried: Array  # before calibration
     alpha: Array
-    seen: Array  # training photos
     counts: NDArray[np.bool_]  # by the photo's mask
 
     def flat(self, values: Array) -> Array:
@@ -59,13 +56,6 @@ class Held:
     def needed(self) -> NDArray[np.floating]:
         """The factor on what is carried at which each pixel's bound meets its error, flat."""
         known = np.minimum(self.error, (self.error / SCALE) ** (1 / POWER) - FLOOR)
-        return self._factor(known)
-
-    def good_below(self) -> NDArray[np.floating]:
-        """The largest factor at which each pixel is called good, flat."""
-        return self._factor(np.minimum(GOOD / 255, (GOOD / 255 / SCALE) ** (1 / POWER) - FLOOR))
-
-    def _factor(self, known: NDArray[np.floating] | float) -> NDArray[np.floating]:
         return ((known - EMPTY * (1 - self.alpha)) / np.maximum(self.carried, 1e-6))[self.counts]
 
 
@@ -75,7 +65,6 @@ class Trust:
 
     gaussians: Gaussians
     errors: Tensor  # [N], mean over the channels, white is 1; calibrated
-    photos: Tensor  # [N], how many see it; 0 where a file says the errors
     factor: float = 1.0  # by which the errors were calibrated
     held: tuple[Held, ...] = ()  # what calibrated them
 
@@ -84,16 +73,15 @@ class Trust:
 
         Of photos that are blurred or noisy, it is the distance from such photos.
         """
-        (carried,), alpha = blended(self.gaussians, camera, self.errors)
-        return bound_of(carried, alpha)
+        return bound_of(*blended(self.gaussians, camera, self.errors))
 
 
-def blended(gaussians: Gaussians, camera: Camera, *values: Tensor) -> tuple[list[Array], Array]:
-    """Values of the Gaussians, [N] each, blended as colours are, and alpha, all [H, W]."""
+def blended(gaussians: Gaussians, camera: Camera, values: Tensor) -> tuple[Array, Array]:
+    """Values of the Gaussians, [N], blended as colours are, and alpha, both [H, W]."""
     with one_torch_thread(), torch.no_grad():
         near = gaussians.near_plane()
-        pictures, alpha, _ = gaussians.rasterize(camera, torch.stack(values, -1), near_plane=near)
-    return [*pictures[0].permute(2, 0, 1).contiguous().numpy()], alpha[0, ..., 0].numpy()
+        pictures, alpha, _ = gaussians.rasterize(camera, values[:, None], near_plane=near)
+    return pictures[0, ..., 0].numpy(), alpha[0, ..., 0].numpy()
 
 
 def bound_of(carried: Array, alpha: Array) -> Array:
@@ -103,24 +91,11 @@ def bound_of(carried: Array, alpha: Array) -> Array:
 
 
 def calibrated(held: Sequence[Held]) -> float:
-    """The factor on what is carried at which SHARE of the photos' pixels stay below their bound, and SHARE
-    of those that are called good are good: the least one. 1 without a photo."""
+    """The factor on what is carried at which SHARE of the photos' pixels stay below their bound. 1 without a
+    photo."""
     if not held:
         return 1.0
-    needed = np.concatenate([one.needed() for one in held])
-    below = np.concatenate([one.good_below() for one in held])
-    factor = max(float(np.quantile(needed, SHARE)), 0.0)
-    right = np.concatenate([one.flat(one.error) for one in held]) <= GOOD / 255
-    order = np.argsort(-below, kind="stable")
-    shares = np.cumsum(right[order]) / np.arange(1, len(order) + 1)
-    called = int((below >= factor).sum())
-    if called <= LEAST_GOOD * len(order) or shares[called - 1] >= SHARE:
-        return factor
-    ends = np.append(np.diff(below[order]) < 0, True)[:called]  # pixels that are alike are good together
-    enough = np.flatnonzero(ends & (shares[:called] >= SHARE))
-    if len(enough) and enough[-1] >= LEAST_GOOD * len(order):
-        return float(max(factor, below[order[enough[-1]]]))
-    return float(max(factor, NONE_GOOD * below[order[0]]))
+    return max(float(np.quantile(np.concatenate([one.needed() for one in held]), SHARE)), 0.0)
 
 
 class LazyTrust:
@@ -148,7 +123,7 @@ def trust_of(gaussians: Gaussians, known: RunCameras | None) -> Trust:
     """Of a run's photos; or without them, what the file of the Gaussians says. ValueError without either."""
     photos = known is not None and any(shows(view) for view in known.views if not view.held_out)
     if gaussians.errors is not None and not photos:
-        return Trust(gaussians, gaussians.errors, torch.zeros(len(gaussians)))
+        return Trust(gaussians, gaussians.errors)
     return learn_trust(gaussians, known or RunCameras(np.zeros(3), []))
 
 
@@ -164,14 +139,12 @@ def learn_trust(
     if not views:
         raise ValueError("trust needs the photos of a run: give its folder, with cameras.json and photos/")
     n = len(gaussians)
-    sums, seen = torch.zeros(n, 2), torch.zeros(n)  # sums of weights, and of weights times errors
+    sums = torch.zeros(n, 2)  # of weights, and of weights times errors
     with one_torch_thread():
         looks = [error_of(gaussians, views[k], known.background) for k in evenly(len(views), photos)]
         for off in looks:
             pixels = torch.stack([off.counts.float(), off.error], -1)
-            both = _back(gaussians, off.camera, torch.zeros(n, 2), pixels)
-            sums += both
-            seen += both[:, 0] > 0.5  # pixels' weight, of a Gaussian that a photo sees
+            sums += _back(gaussians, off.camera, torch.zeros(n, 2), pixels)
         weights = sums[:, 0] + 1
         errors = (sums[:, 1] + PRIOR) / weights
         for _ in range(ROUNDS):
@@ -183,12 +156,10 @@ def learn_trust(
     for view in (out[k] for k in evenly(len(out), held_out)):
         off = error_of(gaussians, view, known.background)
         if off.counts.any():
-            (carried, by), alpha = blended(gaussians, off.camera, errors, seen)
-            held.append(
-                Held(view.name, off.camera, off.error.numpy(), carried, alpha, by, off.counts.numpy())
-            )
+            seen = blended(gaussians, off.camera, errors)
+            held.append(Held(view.name, off.camera, off.error.numpy(), *seen, off.counts.numpy()))
     factor = calibrated(held)
-    return Trust(gaussians, factor * errors, seen, factor, tuple(held))
+    return Trust(gaussians, factor * errors, factor, tuple(held))
 
 
 def _back(
@@ -253,38 +224,26 @@ class Measured:
 
     photos: int
     covered: float  # share of the pixels whose error stays below its bound; 0.9 was promised
-    good: float  # share of those with a bound of at most GOOD
-    right: float  # share of the good ones with an error of at most GOOD
     ause: float  # area between the sparsification curves of trust and of the true error, over the mean error
-    by_photos: float  # the same of the number of photos that see a pixel
 
     def __str__(self) -> str:
-        right = f", {100 * self.right:.1f} % of them are" if self.good else ""
         return (
             f"on {self.photos} held-out photo{'s' * (self.photos > 1)} {100 * self.covered:.1f} % of the "
-            f"pixels stay below their bound; {100 * self.good:.1f} % are called good to {GOOD:.0f} levels"
-            f"{right}; AUSE {self.ause:.3f}, by the number of photos that see a pixel {self.by_photos:.3f}"
+            f"pixels stay below their bound; AUSE {self.ause:.3f}"
         )
 
 
 def measure_trust(trust: Trust) -> Measured | None:
     """None where the run has no held-out photo."""
-    held, pixels = trust.held, 0
+    held, below, areas = trust.held, list[NDArray[np.bool_]](), list[float]()
     if not held:
         return None
-    below = good = right = 0
-    areas = list[tuple[float, float]]()
     for k, one in enumerate(held):
         factor = calibrated([*held[:k], *held[k + 1 :]])
         bound, error = one.flat(bound_of(factor * one.carried, one.alpha)), 255 * one.flat(one.error)
-        called = bound <= GOOD
-        pixels += error.size
-        below += int((error <= bound).sum())
-        good += int(called.sum())
-        right += int((called & (error <= GOOD)).sum())
-        areas.append((_ause(bound, error), _ause(-one.flat(one.seen), error)))
-    ause, by_photos = np.mean(areas, axis=0).tolist()
-    return Measured(len(held), below / pixels, good / pixels, right / max(good, 1), ause, by_photos)
+        below.append(error <= bound)
+        areas.append(_ause(bound, error))
+    return Measured(len(held), float(np.concatenate(below).mean()), float(np.mean(areas)))
 
 
 def _ause(doubt: Array, error: Array) -> float:

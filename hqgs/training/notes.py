@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-from PIL import Image
 
-from hqgs.base.files import LEARNED
-from hqgs.evaluation.looks import learned_picture
 from hqgs.evaluation.records import LearnedRecord
 from hqgs.evaluation.verdict import overdone
 from hqgs.training.methods.cameras import LearnedCamera
@@ -71,12 +66,6 @@ def run_notes(trainer: Trainer) -> list[str]:
                 "`hqgs render --look PHOTO` shows it as a photo's camera would"
             )
     return notes
-
-
-def run_pictures(trainer: Trainer, learned: Sequence[LearnedRecord]) -> dict[str, Image.Image]:
-    """The picture of what was learned of the photos' cameras, by file name; none where nothing was."""
-    photos = [view.image for view in trainer.scene.train]
-    return {LEARNED: learned_picture(photos, learned)} if learned else {}
 
 
 def learned_record(learned: LearnedCamera) -> LearnedRecord:

@@ -53,7 +53,6 @@ class Page:
     gaussians: Gaussians | None
     views: Sequence[RenderedView] = field(repr=False)
     diagnosis: Diagnosis | None = None
-    pictures: Mapping[str, Image.Image] = field(default_factory=dict)  # by file name, as the run wrote them
     folder: Path | None = None  # of the run, which has written its cameras and photos
 
 
@@ -129,7 +128,6 @@ def page_text(page: Page) -> str:
             for record, words in zip(report["learned"], learned, strict=True)
         ],
         learned_heads=["photo", *dict.fromkeys(head for words in learned for head in words)],
-        pictures={Path(name).stem: jpeg(picture, 1080) for name, picture in page.pictures.items()},
         left_out=[_left_out(item) for item in report["left_out"] if not _correction(item)],
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],

@@ -1,19 +1,16 @@
-"""What the page shows: the render from where its camera is, a photo beside it, or splats of the browser."""
+"""What the page shows: the render from where its camera is, and a photo beside it."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.model.constants import SH_C0
 from hqgs.model.formats.turned import matrices
-from hqgs.model.gaussians import Gaussians
 from hqgs.scene.paths import view_matrix
 from hqgs.scene.scene import Camera
 from hqgs.show.frames import Activated, depth_picture, depth_range, grey, trust_picture
@@ -22,7 +19,6 @@ from hqgs.show.trust import LazyTrust
 STREAMED_SIDE = 2048  # px, at most
 MOVED = 0.02  # radians, and of the distance: a camera nearer than that to a photo's sees the same
 Picture = NDArray[np.uint8]
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -99,27 +95,3 @@ def beside(picture: Picture, camera: Camera, photo: Picture, taken: Camera, shar
         edge = int(np.flatnonzero(columns)[-1])
         out[rows, max(edge - 1, 0) : edge + 1] = 255
     return out
-
-
-class BrowserSplats(NamedTuple):
-    """What `viser` draws, in the order of its arguments."""
-
-    centers: Floats  # [N, 3]
-    covariances: Floats  # [N, 3, 3]
-    rgbs: Floats  # [N, 3], 0 to 1
-    opacities: Floats  # [N, 1]
-
-
-def browser_splats(gaussians: Gaussians) -> BrowserSplats:
-    """The Gaussians as the browser draws them.
-
-    Colours are those of the constant harmonic alone: the same from every side. Gaussians with a value
-    that is not finite are left out.
-    """
-    tensors = gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities[:, None], gaussians.sh0
-    rows = torch.cat([tensor.detach().flatten(1) for tensor in tensors], dim=1)
-    g = gaussians.detached().rows(rows.isfinite().all(1))
-    factors = matrices(g.quats.double().numpy()) * g.activated_scales()[:, None].numpy()
-    colors = (0.5 + SH_C0 * g.sh0[:, 0]).clamp(0, 1)
-    found = g.means, factors @ factors.swapaxes(1, 2), colors, g.activated_opacities()[:, None]
-    return BrowserSplats(*(np.asarray(values, np.float32) for values in found))

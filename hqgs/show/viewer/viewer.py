@@ -29,12 +29,10 @@ from hqgs.show.frames import Activated
 from hqgs.show.trust import LazyTrust
 from hqgs.show.viewer.guard import PORT, start_server
 from hqgs.show.viewer.measure import Ruler
-from hqgs.show.viewer.pictures import Pose, beside, browser_splats, same_view, shown
+from hqgs.show.viewer.pictures import Pose, beside, same_view, shown
 
 SHARP = 800  # px: height of a picture at rest
 FREE = "(free)"
-BLACK = np.zeros((1, 1, 3), np.uint8)  # what is behind the Gaussians
-RASTERIZER, BROWSER = "rasterizer", "browser"  # who draws
 PATH_FILE = "camera_path.json"
 
 
@@ -96,7 +94,6 @@ class Viewer:
         self._keys: list[Camera] = []
         self._stats = ""
         self._facts: Mapping[str, Mapping[str, str]] = {}
-        self._splats: Any = None  # of the browser, while it draws
         self._server = start_server(port, title)
         self.url: str = f"http://127.0.0.1:{self._server.get_port()}"
         self._up = np.array(UP) if known is None else known.up
@@ -124,8 +121,6 @@ class Viewer:
                 self._start_view(copy)
             for client in self._clients.values():
                 client.stale = True
-            if self._drawn.value == BROWSER:
-                self._draw_in_browser()
         self._stats = _table(stats)
         self._numbers.content = self._stats
 
@@ -143,7 +138,7 @@ class Viewer:
         """Render what pages wait for; whether there was anything."""
         worked = False
         for client in list(self._clients.values()):
-            if self._scene is not None and self._splats is None and client.waits():
+            if self._scene is not None and client.waits():
                 self._render(client)
                 worked = True
         return worked
@@ -230,11 +225,6 @@ class Viewer:
         gui = self._server.gui
         self._numbers = gui.add_markdown(self._stats)
         with gui.add_folder("Picture"):
-            self._drawn = gui.add_dropdown(
-                "Drawn by",
-                (RASTERIZER, BROWSER),
-                hint="The browser moves smoothly and needs a graphics card; it leaves out the harmonics.",
-            )
             self._show: Any = gui.add_dropdown("Show", ("color", "depth", "alpha"))
             self._detail = gui.add_slider("Height, px", 200, 1600, 50, SHARP, hint="of the sharp picture")
         with gui.add_folder("Photos", visible=bool(self._views)):
@@ -251,7 +241,6 @@ class Viewer:
         self.ruler: Ruler = Ruler(self._server, lambda: self._scene, self._refresh)
         for handle in (self._show, self._detail, self._split):
             handle.on_update(self._refresh)
-        self._drawn.on_update(self._change_drawn)
         self._photo.on_update(self._go_to_photo)
         self._cameras_box.on_update(self._toggle_cameras)
         add.on_click(self._add_key)
@@ -287,30 +276,6 @@ class Viewer:
             handle.on_click(lambda _, name=view.name: setattr(self._photo, "value", name))
             made.append(handle)
         return made
-
-    def _change_drawn(self, _: object) -> None:
-        with self._lock:
-            if self._drawn.value == BROWSER:
-                self._draw_in_browser()
-            elif self._splats is not None:
-                self._splats.remove()
-                self._splats = None
-        self._refresh()
-
-    def _draw_in_browser(self) -> None:
-        """The scene as it is, as splats in place of the streamed pictures."""
-        if self._gaussians is None:
-            return
-        old, self._splats = (
-            self._splats,
-            self._server.scene.add_gaussian_splats(
-                f"/splats/{time.monotonic_ns()}", *browser_splats(self._gaussians)
-            ),
-        )
-        if old is not None:
-            old.remove()
-        for client in self._clients.values():
-            client.handle.scene.set_background_image(BLACK)
 
     def _tell_photo(self) -> None:
         rows = self._facts.get(self._photo.value, {}).items()
