@@ -137,15 +137,15 @@ def train(
         eval_every=eval_every,
     )
     if config is not None and asked != run_config():
-        raise ValueError("config is the whole configuration: nothing of it can be given beside it")
+        raise ValueError("config is the whole configuration: give either config or single options, not both")
     out = None if out is None else Path(out).expanduser()
     taken = ranks.first and out is not None and (out / CHECKPOINT).exists()
     if taken and not (resume or overwrite):
-        raise FileExistsError(f"{out} holds a run; resume=True goes on with it, overwrite=True begins anew")
+        raise FileExistsError(f"{out} holds a run; resume=True continues it, overwrite=True starts again")
     if out is not None and ranks.first and not taken:
         strangers(out)
     if resume and overwrite:
-        raise ValueError("resume goes on with the run that is there, overwrite begins anew: give one of them")
+        raise ValueError("resume continues the run, overwrite starts again: give one of them, not both")
     if seconds is not None and iterations is not None:
         raise ValueError("iterations and seconds: only one of them can be given")
     with open_run(scene, config or asked, out, resume, seconds, on_stage, ranks) as trainer:
@@ -260,20 +260,21 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
     config, decisions = trainer.config, trainer.state.decisions
     if decisions.turned:
         config = replace(config, turn=(decisions.turned, decisions.length))
-    model, left_out = trainer.model(), trainer.left_out()
+    model, left_out = trainer.model(), list[LeftOut]()
     model.look, model.world = (scene.test or scene.train)[0].camera, scene.world
     if out is not None and (rows := model.save(out / PLY)):
-        left_out.append(LeftOut(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf"))
+        left_out.append(LeftOut(f"{rows} Gaussians in {PLY}", "their values are NaN or Inf"))
     if guard.skipped:
-        left_out.append(LeftOut(f"{guard.skipped} training steps", "the loss or a gradient was not finite"))
+        left_out.append(LeftOut(f"{guard.skipped} training steps", "the loss or a gradient was NaN or Inf"))
     if guard.culled:
-        why = "a value or a gradient of theirs was not finite"
+        why = "a value or a gradient was NaN or Inf"
         left_out.append(LeftOut(f"{guard.culled} Gaussians", why))
     if trainer.iteration < trainer.length:
         what = f"iterations {trainer.iteration + 1} to {trainer.length}"
         left_out.append(LeftOut(what, "the run was stopped"))
     if not views:
-        left_out.append(LeftOut("held-out metrics", "the scene has no held-out view"))
+        left_out.append(LeftOut("held-out metrics", "no photo is held out to measure with"))
+    left_out += trainer.left_out()
     records = cast(list[RankRecord], ranks.tell(ranks.record()) if ranks.count > 1 else [])
     report = _report(trainer, views, model, left_out, config, records, out) if ranks.first else None
     report = cast(Report, ranks.tell(report)[0])

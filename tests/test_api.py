@@ -96,11 +96,11 @@ def test_a_run_is_not_lost_by_a_second_call(tmp_path: Path) -> None:
     out = tmp_path / "run"
     hqgs.train(tiny_scene(), config=tiny_config(10), out=out)
     before = (out / CHECKPOINT).read_bytes()
-    with pytest.raises(FileExistsError, match="holds a run; resume=True goes on with it, overwrite=True"):
+    with pytest.raises(FileExistsError, match="holds a run; resume=True continues it, overwrite=True"):
         hqgs.train(tiny_scene(), config=tiny_config(10), out=out)
     assert (out / CHECKPOINT).read_bytes() == before
     assert hqgs.train(tiny_scene(), config=tiny_config(10), out=out, resume=True).iterations == 10
-    with pytest.raises(ValueError, match="resume goes on with the run that is there, overwrite begins anew"):
+    with pytest.raises(ValueError, match="resume continues the run, overwrite starts again"):
         hqgs.train(tiny_scene(), config=tiny_config(10), out=out, resume=True, overwrite=True)
     (out / "plan.json").write_text("{}")
     with pytest.raises(KeyboardInterrupt):  # a run that is killed leaves no scene beside others' cameras

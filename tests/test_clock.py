@@ -170,7 +170,9 @@ def test_clean_photos_start_from_points_that_they_agree_on() -> None:
     assert 2 * len(few.points) < len(dense.gaussians) <= max(2 * pixels // PIXELS, 1.5 * len(few.points))
     assert "resolution" in dense.config.leave_out
     assert dense.config.densify.start == GROWS_FROM
-    assert any(item.what == f"growth in the first {GROWS_FROM} iterations" for item in dense.left_out())
+    assert any(
+        item.what == f"densification in the first {GROWS_FROM} iterations" for item in dense.left_out()
+    )
     own = trainer(start_points=0)
     assert len(own.gaussians) == len(few.points)
     assert own.config.densify.start < GROWS_FROM
@@ -196,13 +198,15 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
     assert trainer(eval_every=123).config.eval_every == 123
     asked = trainer(iterations=9_000)
     assert asked.config.iterations == 9_000
-    assert "asked for; more than 4,000 of 7 photos seldom pay" in [row.why for row in asked.rows]
+    assert "asked for; with 7 photos more than 4,000 seldom improve the scene" in [
+        row.why for row in asked.rows
+    ]
     assert "asked for" in [row.why for row in trainer(iterations=4_000).rows if row.what == "length"]
     assert trainer(leave_out="none").config.iterations == 30_000
     assert trainer(method="3dgs").config.iterations == 30_000
     noisy = Trainer(scene, run_config(formation="noise:20"))  # 7 photos, of which none can be held back
     assert noisy.config.iterations == 7_000
-    assert "no photo can be held back to tell when to end" in [row.why for row in noisy.rows]
+    assert "no validation photo can be set aside to find the best length" in [row.why for row in noisy.rows]
     for name in ("ENOUGH", "LEAST_ENOUGH"):
         monkeypatch.setattr(f"hqgs.training.rules.{name}", 700)
     many = trainer()
@@ -216,7 +220,7 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
 
     long = timed(1e6)
     assert long.config.iterations == long.plan.clock_most == 1_050
-    assert any("more looks at the photos do not pay" in note for note in run_notes(long))
+    assert any("more iterations seldom improve the scene" in note for note in run_notes(long))
     short_of = timed(1e-3)
     assert (short_of.config.iterations, short_of.plan.clock_most) == (rules.FEWEST_ITERATIONS, 1_050)
 

@@ -322,9 +322,9 @@ def test_noise_whose_neighbours_go_together_is_not_white() -> None:
     assert found is not None
     assert found.together == pytest.approx(2 * 0.249 / (1 + 2 * 0.249**2), abs=0.08)
     assert all(run.method.noise for run in runs)
-    what = "pixels held back to tell when noise is learned"
+    what = "validation pixels, which warn when noise is learned"
     assert [what in {item.what for item in left_out_of(run.plan().rows)} for run in runs] == [False, True]
-    assert "at least: not white" in str(found)
+    assert "correlated between neighbouring pixels" in str(found)
     for run, told in zip(runs, (True, False), strict=True):
         assert (run.method.prepare(run.scene.train[0]).held is not None) == told
 
@@ -334,11 +334,11 @@ def test_photos_that_were_not_looked_at_are_told() -> None:
     scene, inspector = degraded_scene("none", photos=5), Inspector()
     found = inspector.diagnose(scene, max_photos=3)
     (spared,) = found.passed_over
-    assert spared.what == "a diagnosis of 2 of 5 training photos"
-    assert f"left out: {spared.what}: the 3 that were looked at are spread over the scene" in str(found)
+    assert spared.what == "diagnosis of 2 of 5 photos"
+    assert f"left out: {spared.what}: the 3 measured photos are spread over the scene" in str(found)
     said = left_out_of(Prepared(scene, tiny_config(method="hqgs")).plan().rows)
     (taken,) = inspector.diagnose(scene).passed_over
-    assert taken.what == "the search for an enlargement in 1 of 5 photos"
+    assert taken.what == "diagnosis of enlargement in 1 of 5 photos"
     assert taken in said
     assert not inspector.diagnose(replace(scene, train=scene.train[:3])).passed_over
 

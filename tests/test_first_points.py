@@ -160,17 +160,20 @@ def test_hqgs_starts_from_them_where_points_are_few(tmp_path: Path) -> None:
     np.testing.assert_array_equal(started.gaussians.means[:20].detach().numpy(), sparse.points)
     assert "first points along edges" not in told(started)
     (note,) = json.loads(run_report(started, tmp_path))["notes"]
-    assert note == f"started from the scene's 20 points and {started.first_points - 20} more from the photos"
+    assert (
+        note
+        == f"training started from the scene's 20 points and {started.first_points - 20} found along edges"
+    )
     assert len(trainer(sparse, first_points=0.0).gaussians) == 20
     clean = trainer(sparse, formation="none")
     assert 20 < len(clean.gaussians) <= max(30, pixels // PIXELS)
     assert (longest_to_shortest(clean) > 2).all()
     enough = trainer(scene, first_points=0.01)
     assert len(enough.gaussians) == few
-    assert "points for" in told(enough)["first points along edges"]
+    assert "points are enough" in told(enough)["first points along edges"]
     untold = trainer(replace(sparse, seen=None))
     assert len(untold.gaussians) == 20
-    assert "does not tell" in told(untold)["first points along edges"]
+    assert "does not say" in told(untold)["first points along edges"]
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.5, float("nan")])

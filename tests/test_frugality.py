@@ -12,7 +12,7 @@ import pytest
 from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 import hqgs
-from hqgs.base.left_out import CORRECTION, LeftOut, format_left_out
+from hqgs.base.left_out import CORRECTION, DIAGNOSIS, PHOTO, LeftOut, format_left_out
 from hqgs.base.ranks import ALONE
 from hqgs.pipeline import train
 from hqgs.scene.scene import Scene
@@ -198,12 +198,20 @@ def test_the_table() -> None:
         "left out:\n  a    2.5 MB, -0.01 dB  not needed\n  bcd                    no use"
     )
     table = format_left_out([LeftOut(f"{CORRECTION}blur", "sharp"), *items, LeftOut(f"{CORRECTION}jpeg", "")])
-    first, *rest = table.splitlines()[1:]
-    assert first.split(None, 1) == [
-        "corrections",
-        "the photos show no need of any for blur, jpeg: see the report",
-    ]
+    *rest, last = table.splitlines()[1:]
+    assert last.split(None, 1) == ["corrections", "not needed for blur, jpeg"]
     assert [row.split()[0] for row in rest] == ["a", "bcd"]
+
+
+def test_the_table_begins_with_photos_and_has_five_lines() -> None:
+    looks = [LeftOut(f"{DIAGNOSIS}{k} photos", "") for k in range(3)]
+    items = [*looks, LeftOut("a", ""), *(LeftOut(f"{PHOTO}{k}.png", "blurred") for k in range(7))]
+    lines = format_left_out(items).splitlines()[1:]
+    first = "training photos: 7 0.png, 1.png, 2.png, 3.png, 4.png and 2 more: blurred"
+    assert " ".join(lines[0].split()) == first
+    assert [line.split()[0] for line in lines[1:]] == ["a", "diagnosis", "diagnosis", "diagnosis"]
+    many = format_left_out([LeftOut(str(k), "") for k in range(9)]).splitlines()[1:]
+    assert [" ".join(line.split()) for line in many[3:]] == ["3", "and 5 more the report has them all"]
 
 
 def test_the_number_of_threads_changes_no_bit() -> None:

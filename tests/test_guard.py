@@ -189,7 +189,7 @@ def test_a_photo_that_is_not_finite_is_named_and_the_others_are_trained_on(tmp_p
     assert {(e["view"], e["what"], e["count"]) for e in guard["events"]} == {("view3.png", "photo", 3)}
     assert guard["culled_gaussians"] == 0
     assert report["history"][-1]["psnr"] > report["history"][0]["psnr"]
-    assert {"what": "6 training steps", "why": "the loss or a gradient was not finite"} in report["left_out"]
+    assert {"what": "6 training steps", "why": "the loss or a gradient was NaN or Inf"} in report["left_out"]
 
 
 def test_an_unexplained_loss_names_the_view(faulty: Faulty, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -166,7 +166,7 @@ def test_a_scene_that_learns_the_noise_is_found_out(tmp_path: Path) -> None:
     assert errors[0] < 0.98 * errors[1]
     run_to_end(trainer, tmp_path / "out")  # which only writes
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert any(note.startswith("the learning rates fell to 1/") for note in report["notes"])
+    assert any(note.startswith("the learning rates were lowered to 1/") for note in report["notes"])
     assert any(entry["what"] == "1/50 of each photo's pixels in the loss" for entry in report["left_out"])
     resumed = Trainer(scene, config)
     resumed.restore(tmp_path / "c")

@@ -104,7 +104,10 @@ def test_motion_has_the_direction_of_each_photo() -> None:
     flat = replace(moved.train[0], image=np.full_like(moved.train[0].image, 0.5))
     one_flat = replace(moved, train=[flat, *moved.train[1:]])
     assert motion_left_out(one_flat) == [
-        LeftOut("motion in the loss of 1 of 3 photos", f"no direction is told from {flat.name}")
+        LeftOut(
+            "motion blur in the loss of 1 of 3 photos",
+            f"the direction of the blur could not be measured in {flat.name}",
+        )
     ]
 
 
@@ -215,7 +218,7 @@ def test_the_budget_follows_the_pixels_of_degraded_photos() -> None:
 def test_degraded_photos_are_trained_without_resets() -> None:
     scene, config = tiny_scene(), tiny_config(method="hqgs", hqgs=fixed("noise:6"))
     trainer = Trainer(scene, config)
-    resets = LeftOut("resets of the opacities", "a budget of Gaussians bears none")
+    resets = LeftOut("opacity resets", "with a limit on Gaussians, lost ones do not come back")
     assert resets in trainer.left_out()
     while trainer.iteration < config.densify.stop + 1:
         trainer.step()

@@ -134,7 +134,7 @@ def test_blurred_photo_stays_where_no_other_looks() -> None:
     scene = replace(clean, train=[*clean.train, aside], points=np.concatenate([clean.points, strip]))
     assert left_out(scene) == []
     note = choose_photos(scene)[0].notes[-1]
-    assert note.startswith("blurred training photos kept, as fewer than 3 sharper ones see")
+    assert note.startswith("these blurred training photos are used, as fewer than 3 sharper ones see")
     assert "aside.png" in note
 
 
@@ -154,7 +154,7 @@ def test_empty_photos_go(value: int) -> None:
     scene = changed(clean_scene(), filled(value), 1, 4, 7)
     assert left_out(scene) == ["01.png", "04.png", "07.png"]
     entry = choose_photos(scene)[1][0]
-    assert entry.why == "it is all one colour"
+    assert entry.why == "of one colour only"
     assert f"{value}, {value}, {value}" in (entry.evidence or "")
 
 
@@ -213,7 +213,10 @@ def test_at_least_half_and_three_stay() -> None:
     scene = changed(replace(clean, train=clean.train[:8]), spoil, *range(5))
     chosen, out = choose_photos(scene)
     assert len(chosen.train) == len(out) == 4
-    assert chosen.notes[-1] == "training photos kept so that at least half of them stay: 04.png"
+    assert (
+        chosen.notes[-1]
+        == "these bad training photos are used, so that at least half of the photos stay: 04.png"
+    )
     for count, gone in ((4, 1), (3, 0), (1, 0)):
         few = changed(replace(clean, train=clean.train[:count]), spoil, *range(count))
         assert len(left_out(few)) == gone

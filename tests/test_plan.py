@@ -58,7 +58,7 @@ def test_the_formation_is_what_the_photos_show_and_why() -> None:
     row = next(row for row in plan.rows if row.what == "formation")
     assert row.value.startswith("noise:2")
     assert "levels" in row.evidence
-    assert row.why == "what the photos show"
+    assert row.why == "found in the photos"
     none = next(row for row in plan.rows if row.what == "a correction for blur")
     assert (none.value, none.left_out) == ("none", "a correction for blur")
 
@@ -73,7 +73,7 @@ def test_photos_that_agree_on_no_more_points_have_the_rules_of_few() -> None:
     plan = Prepared(replace(scene, train=flat), config).plan()
     assert plan.first_points == len(scene.points)
     row = next(row for row in plan.rows if row.what == "first points")
-    assert (row.why, row.left_out) == ("the photos agree on no more", None)
+    assert (row.why, row.left_out) == ("no depth along an edge was confirmed by a second photo", None)
     assert (plan.discs, plan.half_size_until) == (False, 0)
 
 
@@ -219,7 +219,7 @@ def test_the_command_takes_photos_of_the_size_that_a_run_does(
     for longest in (1600, 20):
         monkeypatch.setitem(PRESETS, "standard", replace(PRESETS["standard"], longest=longest))
         assert main(["plan", str(tmp_path), "--formation", "noise:9"]) == 0
-        found = re.search(r"as\s+much\s+as\s+([\d,]+)\s+sharp", capsys.readouterr().out)
+        found = re.search(r"the\s+detail\s+of\s+([\d,]+)\s+sharp", capsys.readouterr().out)
         assert found is not None
         told.append(int(found[1].replace(",", "")))
     assert told[1] < told[0] / 1.2

@@ -106,7 +106,7 @@ def test_a_scene_without_held_out_views(tmp_path: Path) -> None:
     scene = Scene(s.name, s.train, [], s.points, s.point_colors, s.source)
     result = train(scene, config=tiny_config(), out=tmp_path)
     assert result.history[-1]["psnr"] is None
-    assert "the scene has no held-out view" in [item.why for item in result.left_out]
+    assert "no photo is held out to measure with" in [item.why for item in result.left_out]
 
 
 def test_an_epoch_visits_every_view_once_in_an_order_of_its_own(probe: Probe) -> None:

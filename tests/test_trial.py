@@ -161,10 +161,10 @@ def test_a_run_learns_no_look_that_does_not_pay() -> None:
     plan = plan_run(replace(facts(), looks=looks), found_of("exposure", "vignetting"), asked)
     assert plan.settings.hqgs.formation == "exposure"
     rows = {row.what: row for row in plan.rows}
-    assert "+0.80 ± 0.20 dB on 6 photos held back" in rows["formation"].evidence
+    assert "+0.80 ± 0.20 dB on 6 validation photos" in rows["formation"].evidence
     left = rows["a learned vignetting"]
     assert left.left_out is not None
-    assert left.evidence == "-3.10 ± 0.40 dB on 6 photos held back from short runs"
+    assert left.evidence == "-3.10 ± 0.40 dB on 6 validation photos of short test runs"
 
 
 def test_a_resumed_run_learns_the_looks_that_paid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,7 +203,7 @@ def test_a_run_is_planned_by_its_trial_and_the_same_again(monkeypatch: pytest.Mo
     config = run_config(iterations=1000, method="hqgs", leave_out="growth", formation="none")
     first, again = (Trainer(replace(scene, seen=seen), config).plan for _ in range(2))
     assert first == again
-    assert "photos held back" in told(first)
+    assert "validation photos" in told(first)
     assert told(Trainer(replace(scene, seen=seen), replace(config, leave_out=())).plan) == ""
 
 
@@ -222,7 +222,7 @@ def test_a_resumed_run_goes_by_the_trial_that_was(tmp_path: Path, monkeypatch: p
             trainer.restore(file)
         while trainer.iteration < trainer.length:
             trainer.step()
-        assert "photos held back" in told(trainer.plan)
+        assert "validation photos" in told(trainer.plan)
         trainer.save(file)
     assert (trainer.iteration, len(trials)) == (4, 1)
 

@@ -6,11 +6,16 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, TypedDict, cast
 
+from hqgs.base.text import some
+
 if TYPE_CHECKING:
     from typing_extensions import NotRequired  # typing has it from Python 3.11 on
 
 PHOTO = "training photo "  # and its name
 CORRECTION = "a correction for "  # and the step of the formation, of what the photos do not show
+DIAGNOSIS = "diagnosis of "  # and what was not measured in each photo
+MOST_ROWS = 5  # on the screen
+Row = tuple[str, str, str]  # what, saved, why
 
 
 class LeftOutRecord(TypedDict):
@@ -40,24 +45,29 @@ class LeftOut:
 
 
 def format_left_out(items: Sequence[LeftOut]) -> str:
-    """A short table of what was left out and what that saved; empty if nothing was.
+    """A table of at most MOST_ROWS of what was left out and what that saved; empty if nothing was.
 
-    Corrections share a row: why each was not made fills a screen, and the report tells it.
+    Photos come first, then what else changes the scene, last what only saved time. The report has all of it.
     """
-    rows = list[tuple[str, str, str]]()
-    steps = [item.what.removeprefix(CORRECTION) for item in items if item.what.startswith(CORRECTION)]
-    if steps:
-        rows.append(
-            ("corrections", "", f"the photos show no need of any for {', '.join(steps)}: see the report")
-        )
+    photos, rows, steps, looks = dict[str, list[str]](), list[Row](), list[str](), list[Row]()
     for item in items:
-        if item.what.startswith(CORRECTION):
-            continue
         saved = [] if item.bytes is None else [f"{item.bytes / 1e6:.1f} MB"]
         saved += [] if item.cost_db is None else [f"{-item.cost_db:+.2f} dB"]
-        rows.append((item.what, ", ".join(saved), item.why))
+        if item.what.startswith(PHOTO):
+            photos.setdefault(item.why, []).append(item.what.removeprefix(PHOTO))
+        elif item.what.startswith(CORRECTION):
+            steps.append(item.what.removeprefix(CORRECTION))
+        else:
+            found = looks if item.what.startswith(DIAGNOSIS) else rows
+            found.append((item.what, ", ".join(saved), item.why))
+    gone = [(f"training photos: {len(names)}", "", f"{some(names)}: {why}") for why, names in photos.items()]
+    needless = [("corrections", "", f"not needed for {', '.join(steps)}")] if steps else []
+    rows = [*gone, *rows, *needless, *looks]
     if not rows:
         return ""
+    if len(rows) > MOST_ROWS:
+        rest = len(rows) - MOST_ROWS + 1
+        rows = [*rows[:-rest], (f"and {rest} more", "", "the report has them all")]
     widths = [max(len(row[k]) for row in rows) for k in range(2)]
     lines = [f"  {what:{widths[0]}}  {saved:{widths[1]}}  {why}" for what, saved, why in rows]
     return "\n".join(["left out:", *lines])

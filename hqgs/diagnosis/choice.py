@@ -64,7 +64,7 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
         return scene, []
     bad = [_bad_values(view) for view in scene.train]
     drops = [
-        _Drop(view, "it holds NaN or Inf", f"{count} of {view.image.size} values")
+        _Drop(view, "NaN or Inf in its pixels", f"{count} of {view.image.size} values")
         for view, count in zip(scene.train, bad, strict=True)
         if count
     ]
@@ -74,7 +74,7 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
         drops += _needless(sound, scene.points, notes)
     if len(drops) > most:
         names = some([drop.view.name for drop in drops[most:]])
-        notes.append(f"training photos kept so that at least half of them stay: {names}")
+        notes.append(f"these bad training photos are used, so that at least half of the photos stay: {names}")
         drops = drops[:most]
     if not drops and not notes:
         return scene, []
@@ -117,16 +117,16 @@ def _empty(
     for k, (view, look) in enumerate(zip(views, looks, strict=True)):
         if view.mask is not None:
             if not view.mask.any():
-                drops[k] = _Drop(view, "its mask hides all of it", "0 pixels count")
+                drops[k] = _Drop(view, "covered by its mask", "0 pixels count")
             continue
         others = int(full[peers[k]].sum())
         if look.colour is None or others < ENOUGH_SHOW or 2 * others <= len(peers[k]):
             continue
         evidence = (
             f"its colour is {', '.join(f'{c:.0f}' for c in look.colour)} with a standard deviation of "
-            f"{look.spread:.1f} levels; {others} of {len(peers[k])} photos of its points show something"
+            f"{look.spread:.1f} levels; {others} of {len(peers[k])} photos of the same points show detail"
         )
-        drops[k] = _Drop(view, "it is all one colour", evidence)
+        drops[k] = _Drop(view, "of one colour only", evidence)
     return drops
 
 
@@ -159,13 +159,13 @@ def _blurred(
             needed.append(f"{views[k].name} ({sigmas[k]:.1f} px; {1 - well_seen:.0%} of its points)")
             continue
         evidence = (
-            f"its spectrum is the others' after a Gaussian blur of sigma {sigmas[k]:.1f} px (left out from "
+            f"as blurred as other photos after a Gaussian blur of sigma {sigmas[k]:.1f} px (left out from "
             f"{least:.1f} px); at least {ENOUGH_SHOW} sharper photos see {well_seen:.0%} of its points"
         )
-        drops[k] = _Drop(views[k], "it is far blurrier than other photos of the same things", evidence)
+        drops[k] = _Drop(views[k], "far blurrier than other photos of the same things", evidence)
     if needed:
         notes.append(
-            f"blurred training photos kept, as fewer than {ENOUGH_SHOW} sharper ones see a part of their "
-            f"points: {some(needed)}"
+            f"these blurred training photos are used, as fewer than {ENOUGH_SHOW} sharper ones see some of "
+            f"their points: {some(needed)}"
         )
     return drops

@@ -45,8 +45,8 @@ DEVICE_ROUNDS, DEVICE_WEIGHTED = (8, 4)  # of means over photos and points in tu
 
 UNLIKE_GAINS = 0.05  # of the log gains: what is learned
 NO_CAMERA = {
-    "vignetting": "is brighter towards corners, or loses more than two stops there, which no lens does",
-    "response": "is no curve that rises, which no sensor does",
+    "vignetting": "brightens the corners, or darkens them by more than two stops, which no lens does",
+    "response": "does not rise everywhere, as the response of a sensor does",
 }
 
 
@@ -365,9 +365,9 @@ def _within(values: Floats, photo: Numbers, point: Numbers, weights: Floats) -> 
 def exposure_finding(log_gains: NDArray[np.float64] | None, photos: Sequence[PhotoDiagnosis]) -> Finding:
     """`log_gains` [N, 3], as `hqgs.diagnosis.colors` tells them."""
     if log_gains is None:
-        return Finding("exposure", "the photos share too few points to tell")
+        return Finding("exposure", "not measured: the photos share too few points")
     spread = float(np.std(log_gains, axis=0).max())
-    reason = f"gains differ by {spread:.1%} from photo to photo"
+    reason = f"the brightness of the same points differs by {spread:.1%} from photo to photo"
     # Noise that black and white cut off brightens the dark parts of a photo, and darkens the bright ones.
     noises = [noise for photo in photos if (noise := photo.told_noise) is not None]
     least = UNLIKE_GAINS + (0.5 * max(noises) / 255 if noises else 0.0)
@@ -379,17 +379,17 @@ def exposure_finding(log_gains: NDArray[np.float64] | None, photos: Sequence[Pho
 def device_findings(signs: DeviceSigns | None) -> tuple[Finding, Finding]:
     """Vignetting and response."""
     if signs is None:
-        why = "no camera is told to have taken enough of the photos"
+        why = f"not measured: no camera is known to have taken {DEVICE_PHOTOS} photos or more"
         vignetting, response = (Finding(name, why) for name in DEVICES)
         return vignetting, response
     found: list[Finding] = []
     for name, less, more in zip(DEVICES, (signs.vignetting, signs.response), signs.unbounded, strict=True):
         needed = less >= PAYS[name]
-        reason = f"with each camera's {name} photos that were held back agree better by {less:.1%}"
+        reason = f"a {name} for each camera makes photos agree better by {less:.1%}"
         reason += "" if needed else f" (needed from {PAYS[name]:.0%})"
         if more >= PAYS[name] and less < more / 2:
             needed = False
-            reason = f"what would let photos agree better by {more:.1%} {NO_CAMERA[name]}; it counts as light"
-            reason += " that changes, a flash or reflections"
+            reason = f"the {name} that makes photos agree better by {more:.1%} {NO_CAMERA[name]}: the light "
+            reason += "changed (flash, reflections)"
         found.append(Finding(name, reason, name if needed else None, less))
     return found[0], found[1]

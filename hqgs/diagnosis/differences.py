@@ -169,9 +169,11 @@ def _directions(photo: NDArray[Any]) -> NDArray[np.float64]:
 def shake_finding(scene: Scene) -> Finding:
     unlike = unlike_sharpness(scene)
     if unlike is None:
-        return Finding("shake", "the photos are too few or too small to tell")
-    reason = f"photos differ by {unlike.sharpness:.2f} in sharpness, by {unlike.direction:.2f} in direction"
+        return Finding("shake", "not measured: the photos are too few or too small")
+    reason = (
+        f"photos differ by {unlike.sharpness:.2f} in sharpness, by {unlike.direction:.2f} in its direction"
+    )
     if unlike.sharpness < UNLIKE or unlike.direction < TURNED:
-        reason += f" (needed from {UNLIKE:g} and {TURNED:g} in the logarithm of the power of fine details)"
+        reason += f" (needed from {UNLIKE:g} and {TURNED:g}, in the logarithm of the power of fine details)"
         return Finding("shake", reason, None, unlike.sharpness)
     return Finding("shake", reason, "shake", unlike.sharpness)

@@ -124,12 +124,12 @@ def focus_finding(scene: Scene, shaken: bool) -> Finding:
     """`shaken`: photos then differ in sharpness as a whole, whatever their focus."""
     signs = focus_signs(scene)
     if signs is None:
-        return Finding("focus", "the photos share too few points to tell")
+        return Finding("focus", "not measured: the photos share too few points")
     needed = signs.with_depth >= GOES_WITH_DEPTH or (signs.in_all >= DIFFERS and not shaken)
     reason = (
-        f"points are sharper or softer from photo to photo by {signs.with_depth:.2f} with their distance and "
+        f"the sharpness of points differs from photo to photo by {signs.with_depth:.2f} with their distance, "
         f"by {signs.in_all:.2f} in all"
     )
     if not needed:
-        reason += f" (needed from {GOES_WITH_DEPTH:g} or {DIFFERS:g} in the logarithm of contrast)"
+        reason += f" (needed from {GOES_WITH_DEPTH:g} or {DIFFERS:g}, in the logarithm of contrast)"
     return Finding("focus", reason, "focus" if needed else None, signs.with_depth)

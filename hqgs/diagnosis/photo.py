@@ -108,7 +108,7 @@ def inspect_photo(
         h, w = levels.shape[:2]
         if h > height or w > width:
             raise ValueError(
-                f"the small photo of {name!r} is {w} x {h}, larger than its photo {width} x {height}"
+                f"the small photo of {name!r} is {w} x {h} px, larger than its photo, {width} x {height} px"
             )
         near = max(1, round(height / h))  # sides were rounded up, which of small ones is much
         fits = (f for f in (near, *range(1, 17)) if (small_side(height, f), small_side(width, f)) == (h, w))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
-from hqgs.base.left_out import LeftOut
+from hqgs.base.left_out import DIAGNOSIS, LeftOut
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.state import own_state
 from hqgs.diagnosis.colors import (
@@ -71,7 +71,7 @@ class Diagnosis:
         ]
         lines += ["", f"{self.scene}: {self.formation}"]
         for name, needed, reason in self.needs():
-            lines.append(f"  {name:11}{'needed   ' if needed else 'not seen '} {reason}")
+            lines.append(f"  {name:11}{'needed    ' if needed else 'not needed'} {reason}")
         lines += [f"  left out: {item.what}: {item.why}" for item in self.passed_over]
         return "\n".join(lines)
 
@@ -144,7 +144,7 @@ class Inspector:
         *_, shake, focus = own
         blur = _blur(photos)
         if unlike := [part.name for part in (shake, focus) if part.needed]:
-            reason = f"each photo has its own, see {' and '.join(unlike)}"
+            reason = f"it differs from photo to photo: see {' and '.join(unlike)}"
             blur = replace(blur, step=None, reason=reason)
         faults = blur, _lowres(photos), _noise(photos)
         jpeg = _jpeg(photos, alone=not any(part.needed for part in (*faults, film)))
@@ -176,17 +176,17 @@ def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
 
 def _passed_over(total: int, looked_at: int, taken: int) -> tuple[LeftOut, ...]:
     """What was not looked at of `total` photos; `taken`: those that count as enlarged like the probes."""
-    spread = "are spread over the scene and stand for all"
+    spread = "measured photos are spread over the scene"
     looks = []
     if looked_at < total:
-        what = f"a diagnosis of {total - looked_at} of {total} training photos"
-        looks.append(LeftOut(what, f"the {looked_at} that were looked at {spread}"))
+        what = f"{DIAGNOSIS}{total - looked_at} of {total} photos"
+        looks.append(LeftOut(what, f"the {looked_at} {spread}"))
     if taken:
-        what = f"the search for an enlargement in {taken} of {looked_at} photos"
-        looks.append(LeftOut(what, f"{looked_at - taken} others agree on it"))
+        what = f"{DIAGNOSIS}enlargement in {taken} of {looked_at} photos"
+        looks.append(LeftOut(what, f"the other {looked_at - taken} photos agree"))
     if total > MOST_PHOTOS:
-        what = f"a look at the focus of {total - MOST_PHOTOS} of {total} training photos"
-        looks.append(LeftOut(what, f"{MOST_PHOTOS} {spread}"))
+        what = f"{DIAGNOSIS}focus in {total - MOST_PHOTOS} of {total} photos"
+        looks.append(LeftOut(what, f"the {MOST_PHOTOS} {spread}"))
     return tuple(looks)
 
 
@@ -196,41 +196,45 @@ def _lowres(photos: Sequence[PhotoDiagnosis]) -> Finding:
     known = all(photo.enlargement.evidence is None for photo in photos)
     of = f"{count} of {len(photos)} photos"
     if factor == 1 or 2 * count <= len(photos):
-        reason = f"{len(photos) - factors.count(1)} of {len(photos)} photos show the grid of an enlargement"
+        reason = (
+            f"{len(photos) - factors.count(1)} of {len(photos)} photos show the pixel grid of an enlargement"
+        )
         return Finding("lowres", reason, None, 1.0, _spread_of(factors))
     small = next(photo.enlargement for photo in photos if photo.enlargement.factor == factor)
     size = f"{small.width} x {small.height}"
-    at_hand = f"the small photos of about {size} px are at hand"
-    how = at_hand if known else f"{of} show the grid of smaller pixels"
+    at_hand = f"the original small photos of about {size} px are there"
+    how = at_hand if known else f"{of} show the pixel grid of a smaller photo"
     reason = f"enlarged by {factor}: {how}"
     return Finding("lowres", reason, f"lowres:{factor}", float(factor), _spread_of(factors))
 
 
 def _jpeg(photos: Sequence[PhotoDiagnosis], alone: bool) -> Finding:
     qualities = [photo.jpeg.quality for photo in photos if photo.jpeg.quality is not None]
-    of = f"{len(qualities)} of {len(photos)} photos show quantised coefficients"
+    of = f"{len(qualities)} of {len(photos)} photos show JPEG quantisation"
     if 2 * len(qualities) <= len(photos):
         return Finding("jpeg", of)
     quality = float(np.median(qualities))
     spread = _spread_of(qualities)
     limit = BAD_QUALITY if alone else VISIBLE_QUALITY
     if quality >= limit:
-        reason = f"quality {quality:.0f} is good enough to take the photos as they are (needed below {limit})"
+        reason = f"quality {quality:.0f} needs no correction (needed below {limit})"
         return Finding("jpeg", reason, None, quality, spread)
     (row, column), _ = Counter(photo.jpeg.phase for photo in photos if photo.jpeg.quality).most_common(1)[0]
     if (row, column) != (0, 0):
-        reason = f"{of}, but from row {row} and column {column} on: cropped since, which no step can say"
+        reason = (
+            f"{of}, with blocks that start at row {row}, column {column}: cropped since, cannot be corrected"
+        )
         return Finding("jpeg", reason, None, quality, spread)
     return Finding("jpeg", f"{of} of quality {quality:.0f}", f"jpeg:{quality:.0f}", quality, spread)
 
 
 def _video(photos: Sequence[PhotoDiagnosis]) -> Finding:
     details = [photo.film for photo in photos if photo.film is not None]
-    reason = f"{len(details)} of {len(photos)} photos are told to be frames of a film"
+    reason = f"{len(details)} of {len(photos)} photos are frames of a film"
     if 2 * len(details) <= len(photos):
         return Finding("video", reason)
     detail, spread = float(np.median(details)), _spread_of(details)
-    reason += f"; as decoded, the finest details are {detail:.2f} times as strong as coarser ones"
+    reason += f"; their finest details are {detail:.2f} times as strong as coarser ones"
     coarse = detail < COARSE_FILM
     reason += "" if coarse else f" (needed below {COARSE_FILM:g})"
     return Finding("video", reason, "video" if coarse else None, detail, spread)
@@ -238,14 +242,16 @@ def _video(photos: Sequence[PhotoDiagnosis]) -> Finding:
 
 def _by_codec(unlike: Finding) -> Finding:
     """Shake or focus of a coarse film, whose codec takes more of some frames than of others."""
-    reason = f"{unlike.reason}; in a coarse film its codec does that"
+    reason = f"{unlike.reason}; strong compression of the film causes that"
     return replace(unlike, step=None, reason=reason) if unlike.needed else unlike
 
 
 def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
     known = [(photo.noise, photo.noise_limit) for photo in photos if photo.noise is not None]
     if not known:
-        return Finding("noise", "the photos are too small or too clipped to tell")
+        return Finding(
+            "noise", "not measured: the photos are too small, or too much of them is black or white"
+        )
     level, limit = (float(value) for value in np.median(known, axis=0))
     spread = None if _pooled(photos) else _spread_of([noise for noise, _ in known])
     noisy = sum(photo.told_noise is not None for photo in photos)
@@ -254,7 +260,7 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
     kind, more = "white noise of", ""
     if together > SCENE_WHITE:
         kind = "noise of at least"
-        more = f"; neighbouring pixels go together by {together:.2f} at least: not white"
+        more = f"; correlated between neighbouring pixels ({together:.2f} or more)"
     # times the noise of the quieter photos in the noisier ones: each has its own
     if spread is not None and noisy > 0.1 * len(known) and loud >= 2.5 * quiet:
         reason = f"{kind} {quiet:.1f} levels in some photos and {loud:.1f} in others{more}"
@@ -262,7 +268,7 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
     if level >= limit:
         return Finding("noise", f"{kind} {level:.1f} levels{more}", f"noise:{level:.0f}", level, spread)
     if spread is None:
-        reason = f"below {limit:.0f} levels the JPEG hides it, and no more than that is seen"
+        reason = f"less than {limit:.0f} levels, which JPEG compression hides"
     else:
         reason = f"{level:.1f} levels could be fine texture (needed from {limit:g})"
     return Finding("noise", reason, None, level, spread)
@@ -271,7 +277,7 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
 def _blur(photos: Sequence[PhotoDiagnosis]) -> Finding:
     blurs = [photo.blur for photo in photos if photo.blur is not None]
     if not blurs:
-        return Finding("blur", "the photos are too small to tell")
+        return Finding("blur", "not measured: the photos are too small")
     sigma = float(np.median([blur.sigma for blur in blurs]))
     least = float(np.median([photo.blur_limit for photo in photos]))
     kind, count = Counter(blur.kind for blur in blurs).most_common(1)[0]
@@ -281,7 +287,7 @@ def _blur(photos: Sequence[PhotoDiagnosis]) -> Finding:
     spread = None if _pooled(photos) else _spread_of(amounts)
     if sigma < least:
         blurred = sum(blur.sigma >= least for blur in blurs)
-        reason = f"sigma {sigma:.1f} px is within what sharp photos show (needed from {least:.1f} px)"
+        reason = f"sigma {sigma:.1f} px is as sharp as good photos (needed from {least:.1f} px)"
         reason += f"; {blurred} of {len(blurs)} photos are blurred" if blurred else ""
         return Finding("blur", reason, None, sigma, spread)
     name, unit = {
@@ -290,7 +296,7 @@ def _blur(photos: Sequence[PhotoDiagnosis]) -> Finding:
         "motion": ("motion", "length"),
     }[kind]
     step = f"{name}:{within(KINDS[name], round(amount, 1)):g}"  # enlarged ones may have more
-    reason = f"the spectra fall as after {kind} blur of {unit} {amount:.1f} px"
+    reason = f"the spectra fall off as after {kind} blur of {unit} {amount:.1f} px"
     return Finding("blur", reason, step, amount, spread)
 
 

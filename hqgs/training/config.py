@@ -16,15 +16,15 @@ from hqgs.scene.constants import BACKGROUND
 AUTO, NONE = "auto", "none"
 METHODS = {
     "3dgs": "3D Gaussian Splatting",
-    "srgs": "renders are judged at the size of low-resolution photos as well",
-    "hqgs": "renders are degraded as the photos were before they are compared",
+    "srgs": "for low-resolution photos: renders are compared at their size and at full size",
+    "hqgs": "renders get the degradation of the photos before they are compared",
     AUTO: "hqgs",
 }
 ITEMS = {
-    "photos": "training photos that are broken, empty or far too blurred",
-    "growth": "Gaussians finer than the photos' pixels",
+    "photos": "training photos that are broken, empty or very blurred",
+    "growth": "splitting Gaussians that are smaller than the photos' pixels",
     "resolution": "full resolution in the first part of the run",
-    "iterations": "steps that no longer pay",
+    "iterations": "iterations after which nothing improves",
 }
 ASKED_FOR = ("resolution", "iterations")  # automatic only where a run's start, or no number, asks for it
 AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
@@ -62,7 +62,7 @@ def check_items(names: set[str]) -> None:
     """ValueError, which lists the items there are, for an unknown one."""
     if unknown := sorted(names - ITEMS.keys()):
         raise ValueError(
-            f"leave out: there is no {unknown[0]!r}; there are: {AUTO}, {NONE}, or some of {', '.join(ITEMS)}"
+            f"leave out: unknown {unknown[0]!r}; wanted {AUTO}, {NONE}, or some of {', '.join(ITEMS)}"
         )
 
 
@@ -236,37 +236,37 @@ class TrainOptions:
     """What a user says of a run, as `hqgs.train` and the command line take it; None: not said."""
 
     preset: Annotated[str | None, choice(*PRESETS), Unsaid] = None
-    """quick: 1,000 iterations on small photos, a first look. standard (so it is): as long as it pays,
-    photos of at most 1600 px. best: 30,000 iterations, photos as they are."""
+    """quick: 1,000 iterations on small photos, for a first look. standard (the default): until the scene
+    stops improving, photos of at most 1600 px. best: 30,000 iterations, photos at full size."""
     iterations: Number = None
-    """Training views to see (standard: 150 for each clean photo, 4,000 at least, at most 30,000, fewer where
-    the scene has stopped improving)."""
+    """Number of training views to render (standard: 150 for each photo, from 4,000 to 30,000; fewer if the
+    scene stops improving)."""
     batch: Number = None
-    """Views in a step (1). Several processes of torchrun share them out: docs/machines.md."""
+    """Views in a step (1). Several processes of torchrun share them: docs/machines.md."""
     seconds: Seconds = None
-    """Train for S seconds, in place of --iterations: the best scene that this machine makes in them."""
+    """Train for S seconds, instead of --iterations: the best scene that this machine can make in them."""
     method: Annotated[
         str | None, tyro.conf.arg(metavar="NAME", help=f"One of {', '.join(METHODS)} (auto)."), Unsaid
     ] = None
     formation: Annotated[str | None, tyro.conf.arg(metavar="KIND"), Unsaid] = None
-    """What hqgs takes for the photos' degradation (auto: it looks)."""
+    """What degraded the photos, such as blur:1.3+noise:10 (auto: measured in the photos)."""
     guidance: Annotated[str | None, choice(*GUIDANCES), Unsaid] = None
-    """Of hqgs: formation, or paper, its published form (formation)."""
+    """For the method hqgs: formation, or paper, the published method (formation)."""
     leave_out: Annotated[
         str | None,
         tyro.conf.arg(
             metavar="LIST",
-            help=f"What the run may do without where the scene does not need it: {AUTO}, {NONE}, or some of "
-            f"{','.join(ITEMS)} ({AUTO}); a list without iterations trains all of them.",
+            help=f"What may be left out to save time, if the scene does not need it: {AUTO}, {NONE}, or some "
+            f"of {','.join(ITEMS)} ({AUTO}). A list without iterations trains all iterations.",
         ),
         Unsaid,
     ] = None
     max_gaussians: Number = None
-    """Bounds the memory (1,000,000)."""
+    """The most Gaussians; limits the memory (1,000,000)."""
     eval_every: Number = None
-    """Iterations between evaluations (a tenth of the run, 50 at least)."""
+    """Iterations between measurements on held-out photos (a tenth of the run, at least 50)."""
     seed: Seed = None
-    """Another seed gives another run of the same quality (0)."""
+    """Seed of all random numbers (0)."""
 
     def resolved(self, before: TrainConfig | None = None) -> TrainConfig:
         """The configuration that is meant; `before`: of the run that goes on, or is done alike.

@@ -32,7 +32,7 @@ def by_held_photos(schedule: Schedule, state: TrainState, psnr: Callable[[], flo
         if iteration - state.best_at >= PATIENCE:
             length = min(total, math.ceil((1 + REST) * iteration))
             decisions = replace(decisions, length=length, released=iteration)
-            why = "the held-back photos stopped improving"
+            why = "the validation photos stopped improving"
             told = f"best {state.best:.2f} dB at iteration {state.best_at}, {now:.2f} dB at {iteration}"
             left = f"iterations {length + 1} to {total}"
             row = PlanRow("length", f"{length:,} iterations", why, told, "iterations", iteration, left)
@@ -40,8 +40,10 @@ def by_held_photos(schedule: Schedule, state: TrainState, psnr: Callable[[], flo
     if iteration == schedule.config.densify.stop:
         decisions = replace(decisions, released=iteration)
     if decisions.released:
-        why = "early enough that the scene can grow where only they look"
-        state.rows.append(PlanRow("photos held back", "back", why, "", "held_photos", iteration))
+        why = "the scene needs them where no other photo looks"
+        state.rows.append(
+            PlanRow("validation photos", "trained on from here", why, "", "held_photos", iteration)
+        )
     return decisions
 
 

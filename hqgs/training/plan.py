@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, cast
 
-from hqgs.base.left_out import LeftOut
+from hqgs.base.left_out import CORRECTION, LeftOut
 from hqgs.base.text import aligned
 from hqgs.base.typed import build
 from hqgs.evaluation.constants import SCATTER
@@ -41,7 +41,7 @@ class Tried:
         return self.gain > SCATTER and self.sure > 1
 
     def __str__(self) -> str:
-        return f"{self.gain:+.2f} ± {self.error:.2f} dB on {self.photos} photos held back from short runs"
+        return f"{self.gain:+.2f} ± {self.error:.2f} dB on {self.photos} validation photos of short test runs"
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,11 @@ def essential(plan: RunPlan) -> str:
 
 
 def plan_table(rows: Sequence[PlanRow]) -> str:
-    """The rows as lines that a person reads."""
-    return aligned([(row.what, row.value, _reason(row)) for row in rows])
+    """The rows as lines that a person reads; the corrections that are not needed share the last one."""
+    none = [row.what.removeprefix(CORRECTION) for row in rows if row.what.startswith(CORRECTION)]
+    lines = [(row.what, row.value, _reason(row)) for row in rows if not row.what.startswith(CORRECTION)]
+    last = [("other corrections", "none", f"not needed for {', '.join(none)}")] if none else []
+    return aligned(lines + last)
 
 
 def _reason(row: PlanRow) -> str:

@@ -128,7 +128,7 @@ def method(draft: Draft) -> None:
         draft.note(draft.asked.method, "asked for")
         return
     draft.set(method="hqgs")
-    draft.note("hqgs", "it takes photos for what they are; nothing else was asked for")
+    draft.note("hqgs", "the default: its loss takes the degradation of the photos into account")
 
 
 def formation(draft: Draft) -> None:
@@ -139,7 +139,7 @@ def formation(draft: Draft) -> None:
         text = str(parse_formation(asked))
         draft.note(text, "asked for")
     elif diagnosis is None:
-        raise ValueError("the formation is auto, and nobody has looked at the photos")
+        raise ValueError("formation is auto, which needs a diagnosis of the photos; got None")
     else:
         looks = draft.facts.looks
         out = {name for name, tried in looks.items() if not tried.pays}
@@ -150,15 +150,15 @@ def formation(draft: Draft) -> None:
             for name, needed, why in diagnosis.needs()
             if needed and name not in out
         ]
-        why = "what the photos show" if found else "the photos show nothing that must be undone"
+        why = "found in the photos" if found else "no degradation found that needs a correction"
         draft.note(text, why, "; ".join(found))
         for item in diagnosis.passed_over:
             draft.note("left out", item.why, what=item.what, left_out=item.what)
         for name, needed, why in diagnosis.needs():
             if not needed:
                 what = CORRECTION + name
-                draft.note("none", f"not seen: {why}", what=what, left_out=what)
-        why = "photos held back from short runs, in the look of their camera, do not gain by it"
+                draft.note("none", f"not needed: {why}", what=what, left_out=what)
+        why = "in short test runs it did not improve the validation photos"
         for name in looks:
             if name in out:
                 what = f"a learned {name}"
@@ -172,29 +172,29 @@ def loss(draft: Draft) -> None:
     if settings.method == "srgs":
         texture = settings.srgs.texture_weight
         value = f"{1 - texture:g} at the photos' own resolution, {texture:g} at full size"
-        draft.note(value, "SRGS: each view ties finer pixels")
+        draft.note(value, "SRGS: renders are compared at both sizes")
     elif settings.method == "hqgs" and not draft.formed:
         draft.note("L1 + 5 SCS of modulated Gaussians", "the published form was asked for")
     elif "jpeg" in has:
-        why = "a file says no more of a coefficient than the cell that it lies in"
+        why = "a JPEG file only says in which rounding interval (cell) each DCT coefficient lies"
         draft.note(f"distance to the JPEG's cells + {settings.hqgs.jpeg_pixels:g} L1", why)
     elif "noise" in has or has == FILM:
-        why = "the photos' mean is nearer to the truth than their median, and D-SSIM asks for the noise"
-        draft.note(f"squares up to {KNEE:g} sigma of the noise, then L1", why)
+        why = "squared error averages the noise away; L1 and D-SSIM would fit it"
+        draft.note(f"squared error up to {KNEE:g} sigma of the noise, then L1", why)
     else:
-        draft.note(f"{1 - LAMBDA_DSSIM:g} L1 + {LAMBDA_DSSIM:g} D-SSIM", "as 3DGS has it")
+        draft.note(f"{1 - LAMBDA_DSSIM:g} L1 + {LAMBDA_DSSIM:g} D-SSIM", "the loss of 3DGS")
     if "grain" in has:
         what = f"D-SSIM in the loss of {f'{facts.noisy} {of}' if facts.noisy else 'photos with noise'}"
-        draft.note("as under noise", "it asks for the noise that they have", what=what, left_out=what)
+        draft.note("none", "D-SSIM would fit their noise", what=what, left_out=what)
     if operators := [step for step in draft.degradation.steps if step.kind in LINEAR]:
-        why = "a photo is compared with what it would show of the scene"
-        draft.note("+".join(map(str, operators)), why, what="renders go through")
+        why = "each render gets the photos' degradation before it is compared with the photo"
+        draft.note("+".join(map(str, operators)), why, what="applied to renders")
     if facts.undirected:
-        what = f"motion in the loss of {len(facts.undirected)} {of}"
-        why = f"no direction is told from {some(list(facts.undirected))}"
+        what = f"motion blur in the loss of {len(facts.undirected)} {of}"
+        why = f"the direction of the blur could not be measured in {some(list(facts.undirected))}"
         draft.note("none", why, what=what, left_out=what)
     if own := [kind for kind in LEARNED if kind in has]:
-        draft.note(", ".join(own), "each photo has its own: it is learned with the scene", what="cameras")
+        draft.note(", ".join(own), "different in each photo: learned together with the scene", what="cameras")
 
 
 def budget(draft: Draft) -> None:
@@ -204,27 +204,27 @@ def budget(draft: Draft) -> None:
     if not draft.formed or draft.undegraded or not facts.sizes:
         if (bound := bound_of_few(draft)) < most:
             draft.grow(max_gaussians=bound)
-            why = "more explain each photo alone: cameras found from so few are a little off"
+            why = "poses from few photos are inexact, and more Gaussians would overfit single photos"
             evidence = (
                 f"{facts.photos} photos of {facts.pixels / 1e6:.1f} megapixels, {facts.points:,} points"
             )
             draft.note(f"{bound:,} Gaussians at most", why, evidence)
         else:
-            draft.note(f"{most:,} Gaussians at most", "it bounds the memory")
+            draft.note(f"{most:,} Gaussians at most", "limits the memory")
         return
     degradation = draft.degradation
     wanted = max(gaussians_determined(facts, degradation, settings.hqgs.gaussians_per_pixel), facts.points)
     most = min(most, wanted)
-    told = f"{facts.photos} photos tell as much as {sharp_pixels(facts, degradation):,.0f} sharp pixels"
-    told += f"; the codec kept {facts.kept:,} coefficients" if facts.kept is not None else ""
-    draft.note(f"{most:,} Gaussians at most", "more than the photos determine paint noise and ringing", told)
+    told = f"{facts.photos} photos hold the detail of {sharp_pixels(facts, degradation):,.0f} sharp pixels"
+    told += f"; their files keep {facts.kept:,} DCT coefficients" if facts.kept is not None else ""
+    draft.note(f"{most:,} Gaussians at most", "more Gaussians would fit noise and ringing", told)
     threshold = kept_gradient(facts, degradation, settings.densify.grad_threshold)
     if threshold != settings.densify.grad_threshold:
-        why = "within the JPEG's cells there is none, so growth asks for less"
-        draft.note(f"{threshold:.2g} of gradient", why, what="growth from")
+        why = "lower, as the loss has no gradient within a rounding interval of the JPEG"
+        draft.note(f"gradient of {threshold:.2g}", why, what="densification threshold")
     draft.grow(max_gaussians=most, grad_threshold=threshold)
     if size := settings.hqgs.smallest:
-        draft.note(f"{size:g} px of a photo", "what is finer, no photo has seen", what="smallest Gaussian")
+        draft.note(f"{size:g} px of a photo", "no photo shows finer detail", what="smallest Gaussian")
 
 
 def bound_of_few(draft: Draft) -> int:
@@ -247,27 +247,27 @@ def first_points(draft: Draft) -> None:
         return
     if draft.undegraded:
         wanted, what = first_points_wanted(facts, settings), None
-        why = "points lie at corners alone, and a run from points all over the photos costs less"
+        why = "the scene's points lie at corners only; with points along all edges training is shorter"
     else:
         wanted = int(settings.hqgs.first_points * settings.densify.max_gaussians)
-        why = "bad photos give few points, and under a budget little grows"
+        why = "degraded photos give few points, and the limit on Gaussians leaves little room to add more"
     if not wanted:
-        draft.note(own, "more were not asked for")
+        draft.note(own, "no more points were asked for")
     elif not facts.linked:
-        draft.note(own, "the scene does not tell which photos see which of its points", left_out=what)
+        draft.note(own, "the scene does not say which photos see which of its points", left_out=what)
     elif facts.points >= wanted:
-        draft.note(own, f"it has {facts.points} points for {wanted} that are called for", left_out=what)
+        draft.note(own, f"{wanted:,} points are enough", left_out=what)
     elif facts.agreed == 0:
-        draft.note(own, "the photos agree on no more", left_out=what)
+        draft.note(own, "no depth along an edge was confirmed by a second photo", left_out=what)
     else:
         back = facts.photos <= MANY_PHOTOS
         draft.change(first_points=wanted, found_back=back)
-        where = "found back in each other by the photos" if back else "along the photos' edges"
-        points = f"{facts.points:,} points of the reconstruction, {facts.pixels / 1e6:.1f} megapixels"
+        where = "cross-checked between photos" if back else "along the photos' edges"
+        points = f"{facts.points:,} points in the scene, {facts.pixels / 1e6:.1f} megapixels"
         draft.note(f"{wanted:,}, {where}", why, points)
     if draft.undegraded and draft.dense:
         draft.change(discs=True)
-        draft.note("discs", "as their neighbours lie; depths are exact enough", what="first shapes")
+        draft.note("discs", "laid flat on the surface through their neighbours", what="first shapes")
 
 
 def length(draft: Draft) -> None:
@@ -278,9 +278,12 @@ def length(draft: Draft) -> None:
     settings, facts, has = draft.settings, draft.facts, draft.kinds
     open_ended, enough, why = "iterations" in settings.leave_out, settings.iterations, ""
     if has & set(LEARNED) or (has and facts.photos < FEWEST_VIEWS):
-        enough, why = ENOUGH, "no photo can be held back to tell when to end"
+        enough, why = ENOUGH, "no validation photo can be set aside to find the best length"
     elif draft.formed and not has:
-        enough, why = max(LEAST_ENOUGH, FOR_EACH_PHOTO * facts.photos), "more looks at the photos do not pay"
+        enough, why = (
+            max(LEAST_ENOUGH, FOR_EACH_PHOTO * facts.photos),
+            "more iterations seldom improve the scene",
+        )
     most = enough if open_ended and enough < settings.iterations else None
     if facts.seconds is not None and settings.seconds is not None:
         _by_the_clock(draft, facts.seconds, settings.seconds, None if has else most)
@@ -292,9 +295,9 @@ def length(draft: Draft) -> None:
         left = f"iterations {most + 1} to {settings.iterations}"
         draft.note(f"{most:,} iterations", why, f"{facts.photos} photos", left)
     else:
-        why = "at most: held-back photos tell when they no longer pay" if open_ended else "asked for"
+        why = "at most: training ends when validation photos stop improving" if open_ended else "asked for"
         if not open_ended and not has and enough < settings.iterations:
-            why += f"; more than {enough:,} of {facts.photos} photos seldom pay"
+            why += f"; with {facts.photos} photos more than {enough:,} seldom improve the scene"
         draft.note(f"{settings.iterations:,} iterations", why)
 
 
@@ -304,12 +307,12 @@ def _by_the_clock(draft: Draft, step: StepSeconds, seconds: float, most: int | N
     halves = starts_small(draft)
     planned = fitting(seconds, step, first, halves, most)
     fits = planned != most
-    why = f"as many as fit into {seconds:g} s" if fits else "more looks at the photos do not pay"
+    why = f"as many as fit into {seconds:g} s" if fits else "more iterations seldom improve the scene"
     half = f", {1e3 * step.half:.1f} ms at half size" if halves else ""
     draft.change(settings=with_iterations(draft.settings, planned), clock_most=most or MOST_ITERATIONS)
     draft.note(
         f"{planned:,} iterations",
-        f"{why}; the clock {'corrects that' if fits else 'may end it sooner'}, after growth",
+        f"{why}; {'corrected' if fits else 'shortened'} after densification by the time measured",
         f"{1e3 * step.full:.1f} ms a step{half} at the start",
     )
 
@@ -328,7 +331,7 @@ def fitting(seconds: float, step: StepSeconds, first: float, halves: bool, most:
 
 
 def half_size(draft: Draft) -> None:
-    why = f"a scene takes shape at 1/{COARSE_FACTOR} of the sides"
+    why = "coarse shapes are found as well in small photos, in less time"
     small, items = starts_small(draft), set(draft.settings.leave_out)
     items = items | {"resolution"} if small else items - {"resolution"}
     draft.set(leave_out=tuple(item for item in ITEMS if item in items))
@@ -338,7 +341,7 @@ def half_size(draft: Draft) -> None:
         left = f"full resolution in the first {end} iterations"
         draft.note(f"1/{COARSE_FACTOR} of the sides until iteration {end:,}", why, left_out=left)
     else:
-        why = "none was asked for, or a run from few points or of small or degraded photos loses by it"
+        why = "a start at half size was not asked for, or few points, small or degraded photos forbid it"
         draft.note("full from the start", why)
 
 
@@ -359,24 +362,24 @@ def half_size_end(iterations: int) -> int:
 def growth(draft: Draft) -> None:
     densify, tried, told = draft.settings.densify, draft.facts.tried, ""
     if tried is not None:
-        told = f"without it {tried}; PSNR, SSIM and HaarPSI gain {tried.sure:.1f} times their error"
+        told = f"without it {tried}; mean gain of PSNR, SSIM and HaarPSI: {tried.sure:.1f} standard errors"
     dense = draft.undegraded and draft.dense
-    left, why = None, "3DGS's schedule, fitted to the length of the run"
+    left, why = None, "the schedule of 3DGS, scaled to the length of the run"
     if dense and tried is not None and tried.pays:
         draft.grow(**no_growth(densify))
-        why = "what grows explains each photo alone, and views between photos are worse"
-        draft.note("none", why, told, "growth")
+        why = "in short test runs added Gaussians overfitted the photos: validation photos became worse"
+        draft.note("none", why, told, "densification")
         return
     if dense and densify.start < GROWS_FROM:
         draft.grow(start=GROWS_FROM)
-        why = "until sizes and colours are about right, gradients do not tell where something is missing"
-        left = f"growth in the first {GROWS_FROM} iterations"
+        why = "gradients show missing detail only after sizes and colours are about right"
+        left = f"densification in the first {GROWS_FROM} iterations"
     start, stop, every = draft.settings.densify.start, densify.stop, densify.every
     draft.note(f"every {every} iterations from {start:,} to {stop:,}", why, told, left)
     if draft.formed and not draft.undegraded and densify.reset_every < stop:
         draft.grow(reset_every=stop)
-        what = "resets of the opacities"  # what one takes away seldom comes back where it was
-        draft.note("none", "a budget of Gaussians bears none", left_out=what, what=what)
+        what = "opacity resets"  # what one takes away seldom comes back where it was
+        draft.note("none", "with a limit on Gaussians, lost ones do not come back", left_out=what, what=what)
 
 
 def opacity_decay(draft: Draft) -> None:
@@ -384,7 +387,7 @@ def opacity_decay(draft: Draft) -> None:
     asked, facts = draft.asked.opacity_decay, draft.facts
     if asked is not None or not draft.formed:
         if asked is not None:
-            draft.note(f"{asked:g} of the opacities for each view", "asked for")
+            draft.note(f"{asked:g} of each opacity per view", "asked for")
         return
     agreed = "" if facts.agreed is None else f", which agree on {facts.agreed:.0%} of the depths"
     evidence = f"{facts.photos} photos{agreed}"
@@ -392,26 +395,26 @@ def opacity_decay(draft: Draft) -> None:
     softened = bool(draft.kinds & LINEAR) and not errors  # of fine detail less is left to hold up
     least = 0.8 if many else 0.85 if softened else DEPTHS_AGREED
     if many and not errors and (draft.kinds or facts.agreed is None):
-        draft.note("none", "so many photos bear out what is there, and it would cost detail", evidence)
+        draft.note("none", "so many photos confirm the geometry, and decay would cost detail", evidence)
     elif in_agreement(facts, least) and not errors:
-        draft.note("none", "the photos agree on where things are, and it would cost detail", evidence)
+        draft.note("none", "the photos agree on the depths, and decay would cost detail", evidence)
     else:
         share = DECAY * min(1.0, MANY_PHOTOS / facts.photos)  # as much in a look at all photos
         draft.set(opacity_decay=share)
-        asks = "the photos' errors ask for" if errors else "few photos bear out"
-        why = f"what {asks} would hang in the air between them"
-        draft.note(f"{share:.2g} of the opacities for each view", why, evidence)
+        cause = "errors in the photos" if errors else "photos that are few or disagree"
+        why = f"fades floaters, which come from {cause}"
+        draft.note(f"{share:.2g} of each opacity per view", why, evidence)
 
 
 def dropout(draft: Draft) -> None:
     """Not where cameras are learned: shaken photos of the built-in room lose SSIM by it."""
     asked, photos = draft.asked.dropout, draft.facts.photos
     if asked is not None:
-        draft.note(f"up to {asked:.0%} of the Gaussians in a step", "asked for")
+        draft.note(f"up to {asked:.0%} of the Gaussians hidden in a step", "asked for")
     elif draft.facts.as_photographed and draft.undegraded and photos <= 10:
         draft.set(dropout=DROPOUT)
-        value = f"up to {DROPOUT:.0%} of the Gaussians in a step"
-        draft.note(value, "no Gaussian may explain a photo alone", f"{photos} photos")
+        value = f"up to {DROPOUT:.0%} of the Gaussians hidden in a step"
+        draft.note(value, "with few photos, Gaussians overfit single ones", f"{photos} photos")
 
 
 def shown(draft: Draft) -> None:
@@ -419,8 +422,8 @@ def shown(draft: Draft) -> None:
     if asked is None and draft.formed:
         draft.set(averaged=0.05)
     if (share := draft.settings.averaged) is not None:
-        why = "each step serves one photo, and their mean serves all" if asked is None else "asked for"
-        draft.note(f"the mean over the last {share:.0%} of the steps", why)
+        why = "each step fits one photo, their mean fits all photos" if asked is None else "asked for"
+        draft.note(f"mean of the last {share:.0%} of the steps", why)
 
 
 def rates(draft: Draft) -> None:
@@ -430,11 +433,11 @@ def rates(draft: Draft) -> None:
         draft.note(value, "as published" if asked is None else "asked for")
     elif has == {"jpeg"}:
         draft.set(faster_rates=False)
-        why = "what a codec leaves open is learned sooner at higher rates, and nothing holds it back"
+        why = "higher rates would fit detail that the JPEG files do not determine"
         draft.note("those of 3DGS", why)
     else:
         draft.set(faster_rates=True)
-        draft.note("higher in short runs", "those of 3DGS suit its 30,000 iterations")
+        draft.note("higher in short runs", "the rates of 3DGS are made for 30,000 iterations")
 
 
 def noise_rates(draft: Draft) -> None:
@@ -443,12 +446,12 @@ def noise_rates(draft: Draft) -> None:
     together = None if draft.diagnosis is None else draft.diagnosis.together
     if draft.asked.hqgs.formation == AUTO and together is not None:
         draft.set(hqgs=replace(draft.settings.hqgs, held_pixels=False))
-        why = f"the noise of neighbouring pixels goes together by {together:.2f} at least"
-        draft.note("as planned", why, left_out="pixels held back to tell when noise is learned")
+        why = f"no use where noise of neighbouring pixels is correlated (here {together:.2f} or more)"
+        draft.note("as planned", why, left_out="validation pixels, which warn when noise is learned")
     else:
         share = f"1/{HELD_PIXELS} of each photo's pixels"
-        why = "they tell when the scene would start to learn the noise"
-        draft.note(f"fall where {share} gain nothing", why, left_out=f"{share} in the loss")
+        why = "these pixels are not trained on, and show when training starts to fit the noise"
+        draft.note(f"lower when {share} stop improving", why, left_out=f"{share} in the loss")
 
 
 def needless(draft: Draft) -> None:
@@ -460,14 +463,16 @@ def needless(draft: Draft) -> None:
     left = tuple(item for item in ITEMS if item in items)
     draft.set(leave_out=left)
     if "growth" in items:
-        why = "no photo shows more than that"
-        draft.note(f"not of Gaussians below {FINEST:g} px", why, what="growth of fine ones")
-    draft.note(", ".join(left) or "nothing", "asked for, as far as these photos and this length bear it")
+        why = "no photo shows finer detail"
+        draft.note(f"not below {FINEST:g} px", why, what="splitting of small Gaussians")
+    draft.note(
+        ", ".join(left) or "nothing", "the parts of --leave-out that suit these photos and this length"
+    )
     if "iterations" in left and facts.photos >= FEWEST_VIEWS:
         count = min(4, max(1, round(facts.photos / 20)))
         draft.change(held_photos=count)
-        why = "they tell when more iterations no longer pay, and then come back"
-        draft.note(f"{count} of {facts.photos} at first", why, what="photos held back")
+        why = "show when more iterations stop helping; then they are trained on, too"
+        draft.note(f"{count} of {facts.photos} at first", why, what="validation photos")
 
 
 class Rule(NamedTuple):
@@ -478,27 +483,31 @@ class Rule(NamedTuple):
     source: str  # paper and equation, or what chose its numbers
 
 
-CHOSEN = "measured on held-back photos of fern, fox and horns at half size"
-FEW = "where it pays was measured on sets of 3 to 103 photos"
+CHOSEN = "measured on validation photos of fern, fox and horns at half size"
+FEW = "limits measured on sets of 3 to 103 photos"
 OF_PHOTOS_ALONE = (  # they need no poses
     Rule("method", method, "the default of hqgs train"),
-    Rule("formation", formation, "hqgs/diagnosis/, thresholds beside each measurement"),
+    Rule("formation", formation, "thresholds beside each measurement in hqgs/diagnosis/"),
     Rule("loss", loss, "Kerbl et al. 2023, equation 7; under noise and JPEG " + CHOSEN),
-    Rule("rates under noise", noise_rates, f"white noise of a pixel tells nothing of the next; {CHOSEN}"),
+    Rule("rates under noise", noise_rates, f"for noise that is independent from pixel to pixel; {CHOSEN}"),
 )
 RULES = (
-    Rule("a photo", unused_photos, "what a broken or an empty photo teaches is wrong"),
+    Rule("a photo", unused_photos, "a broken or empty photo would add wrong colours"),
     *OF_PHOTOS_ALONE,
     Rule("budget", budget, "Candes and Donoho 2004; Mip-Splatting, Yu et al. 2024; " + CHOSEN),
     Rule("first points", first_points, f"one for each {PIXELS} pixels, or the budget: {CHOSEN}"),
     Rule("length", length, f"{FOR_EACH_PHOTO} for each photo, {LEAST_ENOUGH:,} at least: {CHOSEN}"),
     Rule("photos' size", half_size, CHOSEN),
-    Rule("growth", growth, f"Kerbl et al. 2023, section 5.2; from {GROWS_FROM} on: {CHOSEN}; none: tried"),
+    Rule(
+        "densification",
+        growth,
+        f"Kerbl et al. 2023, section 5.2; from {GROWS_FROM} on: {CHOSEN}; none: test runs",
+    ),
     Rule("opacity decay", opacity_decay, f"Han et al. 2024, arXiv 2410.18822; {FEW}"),
     Rule("dropout of Gaussians", dropout, f"DropGaussian, Park et al. 2025; {FEW}"),
     Rule("scene at the end", shown, "Polyak and Juditsky 1992; " + CHOSEN),
     Rule("learning rates", rates, "learning_rates in schedule.py; " + CHOSEN),
-    Rule("left out where needless", needless, "docs/results/time.md"),
+    Rule("left out to save time", needless, "docs/results/time.md"),
 )
 
 

@@ -82,7 +82,7 @@ class Trainer:
         state = TrainState(gaussians, self._optimizer(gaussians), densifier, self.schedule.start())
         self.state: TrainState = state
         if plan.first_points > len(scene.points):
-            why = "so many agree between photos, the reconstruction's own among them"
+            why = "the scene's points, and depths on which photos agree"
             state.rows.append(PlanRow("first points found", f"{len(gaussians):,}", why, "", "first_points"))
 
     @property
@@ -184,7 +184,7 @@ class Trainer:
         """What the run did without so far."""
         found, refused = left_out_of(self.plan.rows), self.state.refused
         if refused:
-            why = f"they were no wider than {FINEST:g} pixels of the sharpest photo, so no photo shows more"
+            why = f"smaller than {FINEST:g} pixels of the sharpest photo, so that no photo shows more detail"
             found.append(LeftOut(f"{refused} splits of small Gaussians", why))
         return found + left_out_of(self.state.rows)
 
@@ -259,11 +259,11 @@ class Trainer:
                 self.lengthened = done
                 state.rows = [replace(row, left_out=None) for row in state.rows]
                 state.average.clear()
-                why = "a longer run was asked for after its end"
+                why = "a longer run was asked for after this one had ended"
                 state.rows.append(PlanRow("length", f"{more:,} iterations", why, "", "restore", done))
             self.method.load_state_dict(checkpoint.part("method.", tensors))
         except (KeyError, TypeError, AttributeError, RuntimeError) as error:
-            raise ValueError(f"{path} is no whole checkpoint of a run: {error!r}") from error
+            raise ValueError(f"the checkpoint {path} is incomplete: {error!r}") from error
         self.state = state
 
     def _optimizer(self, gaussians: Gaussians) -> Adam:
@@ -343,8 +343,8 @@ class Trainer:
         guard.skipped_in_a_row = guard.skipped_in_a_row + 1 if skipped == len(views) else 0
         if guard.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise TrainingError(
-                f"the loss or a gradient was not finite in {guard.skipped_in_a_row} steps in a row, up to "
-                f"iteration {state.iteration}; the last loss is {found.step.loss}, of view "
+                f"training stopped: the loss or a gradient was NaN or Inf in {guard.skipped_in_a_row} steps "
+                f"in a row, up to iteration {state.iteration}; the last loss is {found.step.loss}, of view "
                 f"{found.step.view.name!r}"
             )
         return skipped < len(views)

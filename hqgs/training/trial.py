@@ -75,7 +75,7 @@ def calls_for_trial(scene: Scene, plan: RunPlan) -> bool:
 def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = silent) -> Tried | None:
     """What photos held back gain where nothing grows; None: no scatter is known. `plan`: of the run; `begin`
     makes trainers."""
-    on_stage(Stage("growth", 0, 0, "trying on photos held back whether growth pays"))
+    on_stage(Stage("growth", 0, 0, "short test runs: does densification improve validation photos?"))
     exposed = "exposure" if "exposure" in _kinds(plan.settings) else NONE
     config = _settings(plan.settings, len(scene.train), exposed, STEPS)
     found = list[Values]()
@@ -100,7 +100,9 @@ def tried_looks(
     asked = [kind for kind in LOOKS if kind in _kinds(settings)]
     if not asked or len(scene.train) <= EACH or not len(scene.points):
         return {}
-    on_stage(Stage("looks", 0, 0, f"trying on photos held back whether {', '.join(asked)} pay"))
+    on_stage(
+        Stage("looks", 0, 0, f"short test runs: does learning {', '.join(asked)} improve validation photos?")
+    )
     side = min(LOOK_SIDE, max(max(view.camera.width, view.camera.height) for view in scene.train))
     scene = replace(scene, train=sorted(scene.train, key=lambda view: view.device))  # some of each are held
     run = begin(next(_parts(scene, side)), _settings(settings, len(scene.train), NONE, LOOK_STEPS))
