@@ -1,9 +1,8 @@
-"""Folders of photos with what people keep beside them: copies, screenshots, films, bursts, GPS."""
+"""Folders of photos with what people keep beside them: copies, films, cameras of other programs, GPS."""
 
 from __future__ import annotations
 
 import shutil
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +13,10 @@ from test_bare_photos import exif, picture
 from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
 
 from hqgs.base.stages import Stage
-from hqgs.photos.exif import Exif, read_exif
-from hqgs.photos.files import Glance
+from hqgs.photos.exif import read_exif
 from hqgs.scene.load import load_scene
-from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
 from hqgs.scene.sfm.folder import write_colmap_folder
-from hqgs.scene.sfm.front_door import maybe_two, strays, understood
 from hqgs.scene.source import load, pictures
 
 
@@ -34,8 +30,7 @@ def test_of_copies_one_is_used_and_the_others_are_named(tmp_path: Path) -> None:
     for k in range(3):
         picture(k, (64, 64)).save(tmp_path / f"IMG_{k}.jpg", exif=exif(1, 28, "Phone"))
     shutil.copy(tmp_path / "IMG_1.jpg", tmp_path / "IMG_1 (1).jpg")
-    with Image.open(tmp_path / "IMG_2.jpg") as photo:
-        photo.save(tmp_path / "A.png")  # the same pixels, without EXIF
+    shutil.copy(tmp_path / "IMG_2.jpg", tmp_path / "WhatsApp.jpg")
     picture(3).save(tmp_path / "close.png")
     changed = picture(3)
     changed.putpixel((4, 5), (1, 2, 3))
@@ -47,9 +42,9 @@ def test_of_copies_one_is_used_and_the_others_are_named(tmp_path: Path) -> None:
     assert photos.names == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg", "close.png", "closer.png"]
     assert len(photos.sizes) == len(photos.exif) == 5
     assert photos.notes == [
-        "5 photos, 3 of them of 1 camera, 2 duplicates left out",
-        "2 of 7 photos are copies of others and were left out: A.png (of IMG_2.jpg), "
-        "IMG_1 (1).jpg (of IMG_1.jpg)",
+        "5 photos, 3 of them of 1 cameras by EXIF, 2 copies left out",
+        "2 of 7 photos are copies of others and were left out: IMG_1 (1).jpg (of IMG_1.jpg), "
+        "WhatsApp.jpg (of IMG_2.jpg)",
     ]
     assert stages[-1].note == photos.notes[0]
 
@@ -84,7 +79,7 @@ def test_frames_of_a_film_that_stands_still_all_stay(tmp_path: Path) -> None:
     assert looked_at(tmp_path).names == ["0.png", "1.png", "2.png"]
 
 
-def test_photos_in_folders_below_others_are_told_and_copies_among_them(tmp_path: Path) -> None:
+def test_photos_in_folders_below_others_are_told(tmp_path: Path) -> None:
     for name in ("copy", "more", "masks"):
         (tmp_path / name).mkdir()
     for k in range(3):
@@ -95,81 +90,12 @@ def test_photos_in_folders_below_others_are_told_and_copies_among_them(tmp_path:
     picture(5).save(tmp_path / "masks" / "0.png")
     assert looked_at(tmp_path).notes == [
         "3 photos, no camera in EXIF",
-        "1 photo in the folder copy: copies, not used",
-        "2 photos in the folder more, 1 of them copies: not used; put those of one scene into one folder to "
-        "use them",
+        "1 photo in the folder copy: not used; put those of one scene into one folder to use them",
+        "2 photos in the folder more: not used; put those of one scene into one folder to use them",
     ]
     for k in range(3):
         (tmp_path / f"{k}.jpg").unlink()
     assert looked_at(tmp_path).names == ["copy/x.jpg", "more/new.jpg"]
-
-
-def test_films_beside_photos_are_no_second_capture(tmp_path: Path) -> None:
-    for k in range(3):
-        picture(k).save(tmp_path / f"IMG_{k}.JPG", exif=exif(1, 28, "Phone"))
-    (tmp_path / "IMG_1.MOV").write_bytes(b"a film")
-    (tmp_path / "walk.mp4").write_bytes(b"another one")
-    photos = looked_at(tmp_path)
-    assert photos.notes == [
-        "3 photos of 1 camera",
-        "1 film of Live Photos, of which the photos are used: IMG_1.MOV",
-        "1 film beside the photos, which are used alone: walk.mp4; give "
-        f"{tmp_path / 'walk.mp4'} in place of the folder to use that",
-    ]
-
-
-def test_bursts_and_places_are_counted(tmp_path: Path) -> None:
-    for k, name in enumerate(
-        [
-            "IMG_20240102_030405_BURST001.jpg",
-            "IMG_20240102_030405_BURST002.jpg",
-            "00000IMG_00000_BURST20240203040506789_COVER.jpg",
-            "00001IMG_00001_BURST20240203040506789.jpg",
-            "IMG_7.jpg",
-        ]
-    ):
-        tags = exif(1, 28, "Phone" if k < 3 else "Camera")
-        if k < 2:
-            tags.get_ifd(0x8825).update({1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0)})
-        picture(k).save(tmp_path / name, exif=tags)
-    assert looked_at(tmp_path).notes == ["5 photos of 2 cameras, GPS in 2, 4 in 2 bursts"]
-
-
-def taken(name: str, *times: str) -> list[Exif]:
-    found = [datetime.strptime(f"2024:05:{time}", "%Y:%m:%d %H:%M:%S") for time in times]
-    return [Exif(camera=("a", name, "28 28"), taken=time) for time in found]
-
-
-def test_bursts_by_the_second_are_counted() -> None:
-    same = [*taken("x", *["01 10:00:00"] * 4), *taken("y", *["01 10:00:00"] * 2), *taken("x", "01 10:00:01")]
-    text = understood(same, [f"{k}.jpg" for k in range(7)], 0, False)
-    assert text == "7 photos of 2 cameras, 4 in 1 burst"
-
-
-def test_two_captures_in_one_folder_are_told_and_not_refused() -> None:
-    plain, names = [Exif()] * 6, [f"IMG_{k}.jpg" for k in range(6)]
-    assert maybe_two(plain, names) == []
-    times = [f"0{day} 10:0{k}:00" for day in (1, 2) for k in range(3)]
-    assert maybe_two(taken("x", *times), names) == [
-        "perhaps 2 scenes, as photos were taken more than 1 hour apart: 3 from IMG_0.jpg to IMG_2.jpg; "
-        "3 from IMG_3.jpg to IMG_5.jpg. If so, give each its own folder"
-    ]
-    assert maybe_two(taken("x", *[f"01 10:{k}0:00" for k in range(6)]), names) == []
-    assert maybe_two(taken("x", *[f"0{k + 1} 10:00:00" for k in range(6)]), names) == []  # a tourist each
-    assert "several folders" in maybe_two(plain, [f"{'ab'[k // 3]}/{k}.jpg" for k in range(6)])[0]
-    assert (
-        "3 from garden1.jpg"
-        in maybe_two(plain, [f"{w}{k}.jpg" for w in ("room", "garden") for k in (1, 2, 3)])[0]
-    )
-    assert maybe_two(plain, [f"{letter}.jpg" for letter in "abcdef"]) == []
-
-
-def test_the_time_of_a_photo_is_read(tmp_path: Path) -> None:
-    for written, wanted in (("2024:05:01 10:11:12", datetime(2024, 5, 1, 10, 11, 12)), ("0000:00:00", None)):
-        tags = exif(1, 28, "Phone")
-        tags.get_ifd(0x8769)[36867] = written
-        picture(0).save(tmp_path / "a.jpg", exif=tags)
-        assert read_exif(tmp_path / "a.jpg").taken == wanted
 
 
 @pytest.mark.parametrize(
@@ -203,39 +129,6 @@ def test_a_place_without_altitude_or_of_zeros_over_zeros(tmp_path: Path) -> None
     assert found is not None
     assert found[:2] == (5, 6)
     assert found[2] != found[2]
-
-
-def test_a_screenshot_is_left_out_where_it_has_no_place_and_used_where_it_has(
-    cards: Scene,  # noqa: F811
-    tmp_path: Path,
-) -> None:
-    views = sorted([*cards.train, *cards.test], key=lambda view: view.name)
-    for k, view in enumerate(views[:6]):
-        if k == 4:  # a photo that was cut and sent on as PNG
-            Image.fromarray(view.image[: HEIGHT - 6]).save(tmp_path / f"{k}.png")
-        else:
-            photo = Image.fromarray(view.image)
-            photo.save(tmp_path / f"{k}.jpg", exif=exif(1, 0, "Phone"), quality=98)
-    picture(7, (HEIGHT // 2, WIDTH)).save(tmp_path / "shot.png")
-    scene = load_scene(tmp_path)
-    assert scene.sfm is not None
-    assert scene.sfm.not_registered == ["shot.png"]
-    assert scene.notes[1] == "7 photos, 5 of them of 1 camera"
-    size = f"{HEIGHT // 2} x {WIDTH} px"
-    assert scene.notes[2:4] == [
-        f"4.png looks like a screenshot (PNG of {WIDTH} x {HEIGHT - 6} px, no camera in EXIF): it fits among "
-        "the photos all the same, and is used",
-        f"shot.png looks like a screenshot (PNG of {size}, no camera in EXIF): it was left out",
-    ]
-
-
-@pytest.mark.parametrize(("sizes", "found"), [([(4, 3)] * 6, ["Screenshot 1.png"]), ([(6, 13)] * 6, [])])
-def test_photos_that_tell_no_camera_and_screenshots_by_name(
-    sizes: list[tuple[int, int]], found: list[str]
-) -> None:
-    seen = {f"{k}.jpg": size for k, size in enumerate(sizes)} | {"Screenshot 1.png": (6, 13)}
-    looked = {name: Glance(size, "PNG", np.zeros((2, 2), np.uint8)) for name, size in seen.items()}
-    assert list(strays(looked, dict.fromkeys(seen, Exif()))) == found
 
 
 def test_masks_are_looked_at_before_colmap_works(tmp_path: Path) -> None:

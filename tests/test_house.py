@@ -22,7 +22,6 @@ LONG = {  # gsplat's 26 arguments to check, and formats of many dialects
     "read_colmap",
     "_camera",
     "sfm_scene",
-    "readable",
     "load_scene",
 }
 

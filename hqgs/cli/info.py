@@ -108,9 +108,9 @@ def _told(run: RunFolder, report: Any) -> list[str]:
 
 def _photos(path: Path) -> list[str]:
     from hqgs.model.formats.files import FORMATS  # here: they load torch
+    from hqgs.scene.checks import beside
     from hqgs.scene.load import formats_of, scene_folder
     from hqgs.scene.sfm.bare_photos import bare_photos, readable
-    from hqgs.scene.sfm.front_door import cameras_beside
 
     root, inside = scene_folder(path)
     formats = formats_of(root, 1.0)
@@ -129,7 +129,7 @@ def _photos(path: Path) -> list[str]:
         f"{sum(exif.quarter_turns > 0 for exif in photos.exif)} lie on their side",
         f"poses: {poses}",
     ]
-    others = cameras_beside(root, photos.folder) if formats else []  # they are read
+    others = beside(root, photos.folder) if formats else []  # they are read
     lines += [*inside, *(note for note in photos.notes if note not in others)]
     lines += [f"cannot be read: {name} ({why})" for name, why in photos.unreadable.items()]
     return lines

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ _FOCAL, _FOCAL_35MM, _WIDTH, _HEIGHT = 37386, 41989, 40962, 40963
 _X_RESOLUTION, _RESOLUTION_UNIT = 41486, 41488
 _XMP = ("xmp", "XML:com.adobe.xmp")  # what Pillow calls it in JPEG, WebP and HEIC, and in PNG
 _PANORAMA = re.compile(rb"GPano:ProjectionType\W{1,3}equirectangular\b")  # an attribute, or an element
-_TAKEN = 36867  # in that table too
 _GPS = 0x8825  # another such table, with these:
 _NORTH_OR_SOUTH, _LATITUDE, _EAST_OR_WEST, _LONGITUDE, _BELOW_SEA, _ALTITUDE = range(1, 7)
 _MM = {2: 25.4, 3: 10.0}  # of the units that resolutions come in
@@ -39,7 +37,6 @@ class Exif:
     panorama: bool = False  # its XMP data (GPano) say that it is equirectangular
     above: float = math.nan  # m above where a drone took off, by its barometer
     pitch: float | None = None  # degrees above level that its gimbal held the camera, upright
-    taken: datetime | None = None  # by the camera's clock, whole seconds
 
     @property
     def quarter_turns(self) -> int:
@@ -69,14 +66,7 @@ def read_exif(path: Path) -> Exif:
     xmp = xmp.encode(errors="replace") if isinstance(xmp, str) else bytes(xmp)
     panorama = _PANORAMA.search(xmp) is not None
     named = (*names, lens) if known else ()
-    return Exif(orientation, named, focal, gps, panorama, *_of_drone(xmp), _time(more.get(_TAKEN)))
-
-
-def _time(written: Any) -> datetime | None:
-    try:
-        return datetime.strptime(str(written).strip("\0 ")[:19], "%Y:%m:%d %H:%M:%S")
-    except ValueError:
-        return None
+    return Exif(orientation, named, focal, gps, panorama, *_of_drone(xmp))
 
 
 def _focal(more: dict[int, Any], width: int, height: int) -> float:

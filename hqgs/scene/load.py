@@ -18,6 +18,7 @@ from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene import masks
 from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, odd_lenses, photo_folder
+from hqgs.scene.checks import broken, elsewhere, nothing
 from hqgs.scene.constants import BACKGROUND, COPY_SIDE, MOST_BYTES
 from hqgs.scene.faces import CUBE, around, faces_of
 from hqgs.scene.film import frame_details
@@ -29,7 +30,6 @@ from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.names import existing_folder
 from hqgs.scene.place import cut_outs, located, placed, without_missing, without_poseless, without_strays
 from hqgs.scene.random_points import random_points
-from hqgs.scene.refused import above, beside, broken, nothing
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import Search, read_photos
@@ -248,7 +248,7 @@ def _read(root: Path, downscale: float, sfm: bool, search: Search) -> Capture:
     if not sfm and (half := broken(root)) is not None:
         raise ValueError(f"{half}; `--sfm` takes cameras and points from the photos alone")
     if (photos := bare_photos(root, downscale)) is not None:
-        told = [] if sfm else [*above(root), *beside(root)]
+        told = [] if sfm else elsewhere(root)
         if told:
             search.on_stage(Stage("COLMAP", 0, len(photos.names), told[0]))
         capture = read_photos(root, photos, search)

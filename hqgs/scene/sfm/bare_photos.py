@@ -21,23 +21,14 @@ from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import Glance, UnreadableError, decode, glance, needs_heic
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.capture import photo_folder
+from hqgs.scene.checks import beside
 from hqgs.scene.constants import JPEG_QUALITY, MAX_WORKERS, MOST_SIDE
 from hqgs.scene.faces import CUBE, face_name
 from hqgs.scene.film import frames_around
 from hqgs.scene.names import FRAMES, KEPT
-from hqgs.scene.photo_files import is_mask_folder, is_run, masks_among
+from hqgs.scene.photo_files import is_mask_folder, is_run, masks_among, of_maps
+from hqgs.scene.sfm.copies import copies
 from hqgs.scene.sfm.database import seen_size
-from hqgs.scene.sfm.front_door import (
-    cameras_beside,
-    copies,
-    films_beside,
-    maybe_two,
-    not_here,
-    photos_and_maps,
-    photos_below,
-    strays,
-    understood,
-)
 from hqgs.scene.sfm.panoramas import all_around, colmap_faces, faces_seen
 from hqgs.scene.sfm.run import Guess
 
@@ -58,7 +49,6 @@ class BarePhotos:
     exif: list[Exif] = field(default_factory=list)  # of each
     unreadable: dict[str, str] = field(default_factory=dict)  # others, and why
     notes: list[str] = field(default_factory=list)
-    strays: dict[str, str] = field(default_factory=dict)  # what seems not to be of their camera, and why
     others: frozenset[str] = frozenset()  # what COLMAP cannot read as it is, by content or colours
     around: bool = False  # each shows 360 x 180 degrees, and is given to COLMAP as the faces of a cube
 
@@ -167,48 +157,96 @@ def link(source: Path, target: Path) -> None:
 def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
     """The photos of a folder, not looked into yet; None without photos.
 
-    Those of `photo_folder`, or in `root` itself, or, where there are none, in the nearest folders below.
+    Those of `photo_folder`, or in `root` itself, or, where there are none, in the nearest folders below that
+    are not called after depth maps, masks or thumbnails, if others are there.
     """
-    if is_run(root):
-        return None
+    everything = {} if is_run(root) else _photos_in_folders(root)
     folder, left, notes = photo_folder(root, downscale) or (root, downscale, [])
-    names, found = _photos_in(folder), _photos_below(folder)
-    if folder != root and not names and not found:
-        folder, left, notes, names, found = root, downscale, [], _photos_in(root), _photos_below(root)
-    if names:
-        notes = [*notes, *photos_below(folder, names, found)]
-        if folder != root:
-            beside = {k: v for k, v in _photos_below(root).items() if not (root / k).samefile(folder)}
-            plain = {k: v for k, v in beside.items() if not k.startswith(f"{folder.name}_")}  # at other sizes
-            notes += photos_below(root, [f"{folder.name}/{name}" for name in names], plain)
-    else:
-        found, others = photos_and_maps(found)
-        names = [f"{inner}/{name}" for inner, inside in found.items() for name in inside]
-        inner = [*found]
-        if len(inner) == 1:
-            folder, names = folder / inner[0], found[inner[0]]
-        if inner:
-            notes = [*notes, f"the photos are those in {some(inner)}, below {root.name}"]
-        rest = {k: v for k, v in _photos_below(root, deepest=True).items() if k not in (*found, *others)}
-        notes += photos_below(root, [f"{k}/{name}" for k, v in found.items() for name in v], rest)
-        if others:
-            notes.append(f"not taken for photos, by the names of their folders: {some([*others])}")
+    here = {place: names for place, names in everything.items() if place.is_relative_to(folder)}
+    if not here:
+        folder, left, notes, here = root, downscale, [], everything
+    nearest = min((len(place.parts) for place in here), default=0)
+    used = {place: names for place, names in here.items() if len(place.parts) == nearest}
+    maps = {place: names for place, names in used.items() if of_maps(place.name)}
+    if folder in used or len(maps) == len(used):
+        maps = {}
+    used = {place: names for place, names in used.items() if place not in maps}
+    if folder not in used:
+        inner = [place.relative_to(folder).as_posix() for place in used]
+        notes = [*notes, f"the photos are those in {some(inner)}, below {root.name}"]
+        folder = next(iter(used)) if len(used) == 1 else folder
+    sizes = f"{folder.name}_"  # a folder with the photos at other sizes
+    for place, names in everything.items():
+        if place not in used and place not in maps and not (folder != root and place.name.startswith(sizes)):
+            count = f"{len(names)} photo{'s' * (len(names) > 1)}"
+            notes.append(
+                f"{count} in the folder {place.relative_to(root).as_posix()}: not used; put those of one scene "
+                "into one folder to use them"
+            )
+    if maps:
+        told = some([place.relative_to(root).as_posix() for place in maps])
+        notes.append(f"not taken for photos, by the names of their folders: {told}")
+    names = [(place / name).relative_to(folder).as_posix() for place in used for name in used[place]]
     masks = masks_among(names)
     names = [name for name in names if name not in masks]
-    if not names:
-        return None
-    notes += [*films_beside(folder, names), *cameras_beside(root, folder), *not_here(folder)]
-    return BarePhotos(folder, left, names, notes=notes)
+    return BarePhotos(folder, left, names, notes=[*notes, *beside(root, folder)]) if names else None
 
 
 def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     """The photos that can be decoded, with their sizes and EXIF data; the others are in `unreadable`.
 
-    Of those that hold the same pixels one is used, but for frames of a film. The first note says in a line
-    what was understood, as `on_stage` hears.
+    Of copies one is used, but for frames of a film. The first note says in a line what was understood, as
+    `on_stage` hears.
 
     ValueError where HEIC photos lack the extra that reads them, or less than half can be read.
     """
+    looked, unreadable = _looked_at(photos, on_stage)
+    tags = {name: read_exif(photos.folder / name) for name in looked}
+    film, notes = (photos.folder / FRAMES).is_file(), list(photos.notes)
+    twice = {} if film else copies(photos.folder, looked, tags)
+    if twice:
+        pairs = some([f"{name} (of {own})" for name, own in twice.items()])
+        notes.append(f"{len(twice)} of {len(looked)} photos are copies of others and were left out: {pairs}")
+        looked = {name: seen for name, seen in looked.items() if name not in twice}
+    if film and frames_around(photos.folder):
+        tags = {name: replace(tag, panorama=True) for name, tag in tags.items()}
+    sphere, aside = all_around(photos.folder, looked, {name: tags[name] for name in looked})
+    if aside:
+        kind = "flat, most are not" if sphere else "panoramas of 360 x 180 degrees, most are not"
+        notes.append(
+            f"{len(aside)} of {len(looked)} photos are {kind}, and were left out: {some(aside)}; they need a "
+            "folder of their own"
+        )
+        looked = {name: seen for name, seen in looked.items() if name not in set(aside)}
+    exif = [tags[name] for name in looked]
+    if sphere and (untold := [name for name in looked if not tags[name].panorama]):
+        notes.append(
+            f"{len(untold)} photos are taken for panoramas of 360 x 180 degrees by what they show, no file "
+            f"says it ({some(untold)}): if they are flat, cut a row off each, so that it is not 2:1"
+        )
+    if not film or sphere:
+        told = profiles.told({name: seen.colors for name, seen in looked.items()})
+        notes = [_understood(exif, len(twice), sphere), *notes, *told]
+        for note in (notes[0], *told):
+            on_stage(Stage("photos looked at", len(photos.names), len(photos.names), note))
+    return replace(
+        photos,
+        names=[*looked],
+        sizes=[seen.size for seen in looked.values()],
+        exif=exif,
+        unreadable=unreadable,
+        notes=notes,
+        others=frozenset(
+            name
+            for name, seen in looked.items()
+            if seen.format not in COLMAP_FORMATS or (seen.colors is not None and seen.colors.known)
+        ),
+        around=sphere,
+    )
+
+
+def _looked_at(photos: BarePhotos, on_stage: OnStage) -> tuple[dict[str, Glance], dict[str, str]]:
+    """What a glance at each photo tells, and why others cannot be read."""
     if heic := [name for name in photos.names if needs_heic(photos.folder / name)]:
         raise ValueError(
             f"{photos.folder}: {len(heic)} of {len(photos.names)} photos are HEIC ({some(heic)}), which "
@@ -235,55 +273,20 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
         raise ValueError(
             f"{photos.folder}: {len(unreadable)} of {len(photos.names)} photos cannot be read: {reasons}"
         )
-    exif = {name: read_exif(photos.folder / name) for name in looked}
-    film = (photos.folder / FRAMES).is_file()
-    twice = {} if film else copies(photos.folder, looked, exif)
-    notes = list(photos.notes)
-    if twice:
-        pairs = some([f"{name} (of {own})" for name, own in twice.items()])
-        notes.append(f"{len(twice)} of {len(looked)} photos are copies of others and were left out: {pairs}")
-    names = [name for name in looked if name not in twice]
-    looked, tags = {name: looked[name] for name in names}, {name: exif[name] for name in names}
-    if film and frames_around(photos.folder):
-        tags = {name: replace(tag, panorama=True) for name, tag in tags.items()}
-    sphere, aside = all_around(photos.folder, looked, tags)
-    if aside:
-        kind = "flat, most are not" if sphere else "panoramas of 360 x 180 degrees, most are not"
-        notes.append(
-            f"{len(aside)} of {len(names)} photos are {kind}, and were left out: {some(aside)}; they need a "
-            "folder of their own"
-        )
-        names = [name for name in names if name not in set(aside)]
-        looked, tags = {name: looked[name] for name in names}, {name: tags[name] for name in names}
-    if sphere and (untold := [name for name in names if not tags[name].panorama]):
-        notes.append(
-            f"{len(untold)} photos are taken for panoramas of 360 x 180 degrees by what they show, no file "
-            f"says it ({some(untold)}): if they are flat, cut a row off each, so that it is not 2:1"
-        )
-    if not film or sphere:
-        notes.insert(0, understood([*tags.values()], names, len(twice), sphere))
-        told = [
-            *profiles.told({name: seen.colors for name, seen in looked.items()}),
-            *maybe_two([*tags.values()], names),
-        ]
-        for note in (notes[0], *told):
-            on_stage(Stage("photos looked at", len(photos.names), len(photos.names), note))
-        notes += told
-    return replace(
-        photos,
-        names=names,
-        sizes=[seen.size for seen in looked.values()],
-        exif=[*tags.values()],
-        unreadable=unreadable,
-        notes=notes,
-        strays={} if film or sphere else strays(looked, tags),
-        others=frozenset(
-            name
-            for name, seen in looked.items()
-            if seen.format not in COLMAP_FORMATS or (seen.colors is not None and seen.colors.known)
-        ),
-        around=sphere,
-    )
+    return looked, unreadable
+
+
+def _understood(exif: list[Exif], copies: int, around: bool) -> str:
+    """One line: how many photos of how many cameras, copies and places."""
+    cameras = [tags.camera[:2] for tags in exif if any(tags.camera[:2])]
+    located = sum(tags.gps is not None for tags in exif)
+    parts = [f"{len(exif)} {'panoramas of 360 x 180 degrees' if around else 'photos'}"]
+    parts += [
+        f"{len(cameras)} of them of {len(set(cameras))} cameras by EXIF" if cameras else "no camera in EXIF"
+    ]
+    parts += [f"{copies} copies left out"] if copies else []
+    parts += [f"GPS in {located}"] if located else []
+    return ", ".join(parts)
 
 
 def ups(exif: Sequence[Exif]) -> np.ndarray:
@@ -297,24 +300,23 @@ def ups(exif: Sequence[Exif]) -> np.ndarray:
     return found
 
 
-def _photos_below(folder: Path, deepest: bool = False) -> dict[str, list[str]]:
-    """The photos in the folders below, by their paths: those of the first level that has any; or of all."""
-    level, found = [folder], dict[str, list[str]]()
-    seen = {folder.resolve(), *folder.resolve().parents}  # links lead there again
-    for _ in range(FOLDERS_DEEP):
-        inner = (p for place in level for p in place.iterdir() if p.is_dir())
-        level = sorted(
+def _photos_in_folders(root: Path) -> dict[Path, list[str]]:
+    """The photos in a folder and those below, FOLDERS_DEEP levels down; the nearest folders first."""
+    level, found = [root], dict[Path, list[str]]()
+    seen = {root.resolve(), *root.resolve().parents}  # links lead there again
+    for _ in range(FOLDERS_DEEP + 1):
+        found |= {place: names for place in level if (names := _photos_in(place))}
+        inner = sorted(
             p
-            for p in inner
-            if not (is_mask_folder(p.name) or p.name == KEPT or p.name[0] == "." or is_run(p))
+            for place in level
+            for p in place.iterdir()
+            if p.is_dir()
+            and not (is_mask_folder(p.name) or p.name == KEPT or p.name[0] == "." or is_run(p))
+            and os.access(p, os.R_OK | os.X_OK)  # not a card's lost+found
         )
-        level = [p for p in level if os.access(p, os.R_OK | os.X_OK)]  # not a card's lost+found
-        once = {p.resolve(): p for p in sorted(level, key=lambda p: (not p.is_symlink(), p))}
+        once = {p.resolve(): p for p in sorted(inner, key=lambda p: (not p.is_symlink(), p))}
         level = sorted(p for real, p in once.items() if real not in seen)
         seen |= once.keys()
-        found |= {p.relative_to(folder).as_posix(): names for p in level if (names := _photos_in(p))}
-        if found and not deepest:
-            break
     return found
 
 

@@ -12,11 +12,11 @@ from PIL import Image
 
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.files import decode
+from hqgs.scene.checks import nothing
 from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.film import check_film, film_frames, frame_details, write_details
 from hqgs.scene.names import existing_folder
 from hqgs.scene.photo_files import film_at
-from hqgs.scene.refused import nothing
 from hqgs.scene.scene import SfmReport
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import Search, find_cameras

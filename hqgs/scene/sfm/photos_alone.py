@@ -23,7 +23,6 @@ from hqgs.scene.paths import UP
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
 from hqgs.scene.sfm.database import LARGEST
-from hqgs.scene.sfm.front_door import tell_strays
 from hqgs.scene.sfm.refine.tracks import sureness
 from hqgs.scene.sfm.run import run_colmap
 
@@ -112,8 +111,7 @@ def read_photos(root: Path, photos: BarePhotos, search: Search) -> Capture:
             found[name] = Photo(
                 as_text(name), folder / name, camera, viewmat, masks.get(name), details.get(name)
             )
-    placed = set(found)
-    notes = [str(cameras.report), *cameras.photos.notes, *tell_strays(cameras.photos.strays, placed)]
+    notes = [str(cameras.report), *cameras.photos.notes]
     points, colors = keep_finite(*model_points(model), notes)
     seen = None
     if len(points) == model.num_points3D():
