@@ -68,7 +68,7 @@ def test_photos_deeper_than_those_that_are_used_are_told(tmp_path: Path) -> None
         picture(k).save(tmp_path / folder / f"{k}.png")
     photos = looked_at(tmp_path)
     assert photos.names == ["0.png", "1.png"]
-    assert any(note.startswith("1 photo in the folder two/inner: not used") for note in photos.notes)
+    assert any(note.startswith("photos not used are in two/inner (1): put") for note in photos.notes)
 
 
 def test_frames_of_a_film_that_stands_still_all_stay(tmp_path: Path) -> None:
@@ -90,8 +90,7 @@ def test_photos_in_folders_below_others_are_told(tmp_path: Path) -> None:
     picture(5).save(tmp_path / "masks" / "0.png")
     assert looked_at(tmp_path).notes == [
         "3 photos, no camera in EXIF",
-        "1 photo in the folder copy: not used; put those of one scene into one folder to use them",
-        "2 photos in the folder more: not used; put those of one scene into one folder to use them",
+        "photos not used are in copy (1), more (2): put those of one scene into one folder to use them",
     ]
     for k in range(3):
         (tmp_path / f"{k}.jpg").unlink()

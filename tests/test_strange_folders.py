@@ -63,7 +63,7 @@ def test_photos_beside_the_folder_of_images_are_told(tmp_path: Path) -> None:
     photos = looked_at(tmp_path)
     assert photos.folder == tmp_path / "images"
     assert photos.notes[1:] == [
-        "3 photos in the folder second: not used; put those of one scene into one folder to use them"
+        "photos not used are in second (3): put those of one scene into one folder to use them"
     ]
 
 

@@ -165,6 +165,7 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
     here = {place: names for place, names in everything.items() if place.is_relative_to(folder)}
     if not here:
         folder, left, notes, here = root, downscale, [], everything
+    sizes = f"{folder.name}_" if folder != root else "/"  # of folders with the same photos at other sizes
     nearest = min((len(place.parts) for place in here), default=0)
     used = {place: names for place, names in here.items() if len(place.parts) == nearest}
     maps = {place: names for place, names in used.items() if of_maps(place.name)}
@@ -175,14 +176,15 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
         inner = [place.relative_to(folder).as_posix() for place in used]
         notes = [*notes, f"the photos are those in {some(inner)}, below {root.name}"]
         folder = next(iter(used)) if len(used) == 1 else folder
-    sizes = f"{folder.name}_"  # a folder with the photos at other sizes
-    for place, names in everything.items():
-        if place not in used and place not in maps and not (folder != root and place.name.startswith(sizes)):
-            count = f"{len(names)} photo{'s' * (len(names) > 1)}"
-            notes.append(
-                f"{count} in the folder {place.relative_to(root).as_posix()}: not used; put those of one scene "
-                "into one folder to use them"
-            )
+    rest = {place: len(names) for place, names in everything.items() if place not in used | maps}
+    if told := [
+        f"{place.relative_to(root).as_posix()} ({count})"
+        for place, count in rest.items()
+        if not place.name.startswith(sizes)
+    ]:
+        notes.append(
+            f"photos not used are in {some(told)}: put those of one scene into one folder to use them"
+        )
     if maps:
         told = some([place.relative_to(root).as_posix() for place in maps])
         notes.append(f"not taken for photos, by the names of their folders: {told}")

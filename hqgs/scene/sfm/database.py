@@ -54,37 +54,30 @@ def known_cameras(given: dict[str, Any], database: Path) -> pycolmap.Reconstruct
 
 
 def new_cameras(given: dict[str, Any], database: Path) -> None:
-    """A database with the photos and their cameras, whose focal lengths and distortion COLMAP finds."""
-    with pycolmap.Database.open(database) as db:
-        for number, (focal, size) in enumerate(_known(given), 1):
-            camera = _camera(number, "SIMPLE_RADIAL", size, focal or FOCAL * max(size), 0.0)
-            camera.has_prior_focal_length = focal > 0
-            db.write_camera(camera, use_camera_id=True)
-            rig = pycolmap.Rig(rig_id=number)
-            rig.add_ref_sensor(camera.sensor_id)
-            db.write_rig(rig, use_rig_id=True)
-        for k, (name, number) in enumerate(
-            zip(given["names"].tolist(), (given["camera_of"] + 1).tolist(), strict=True), 1
-        ):
-            image = pycolmap.Image(name=name, camera_id=number, image_id=k)
-            db.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=k, rig_id=number)
-            frame.add_data_id(image.data_id)
-            db.write_frame(frame, use_frame_id=True)
+    """A database with the photos and their cameras, whose focal lengths and distortion COLMAP finds.
 
-
-def rigs(given: dict[str, Any], database: Path) -> None:
-    """A database with the faces of photos of all around: one rig for each size of them, its sensors turned by
-    `rotations` [F, 3, 3], which map the first one's frame into theirs; a frame for the F faces of each photo.
+    Of photos of all around one rig for each size of their faces, known but for its pose: its sensors are
+    turned by `rotations` [F, 3, 3], which map the first one's frame into theirs; the F faces of a photo are
+    one frame.
     """
-    rotations = given["rotations"]
-    faces = len(rotations)
+    rotations = given.get("rotations", np.eye(3)[None])
+    faces, names, camera_of = len(rotations), given["names"].tolist(), given["camera_of"].tolist()
+    model, distortion = ("SIMPLE_RADIAL", [0.0]) if faces == 1 else ("SIMPLE_PINHOLE", [])
     with pycolmap.Database.open(database) as db:
-        for number, (focal, size) in enumerate(_known(given)):
+        for number, (focal, size) in enumerate(
+            zip(given["focals"].tolist(), given["sizes"].tolist(), strict=True)
+        ):
             rig = pycolmap.Rig(rig_id=number + 1)
             for k, rotation in enumerate(rotations):
-                camera = _camera(number * faces + k + 1, "SIMPLE_PINHOLE", size, focal)
-                camera.has_prior_focal_length = True
+                params = [focal or FOCAL * max(size), size[0] / 2, size[1] / 2, *distortion]
+                camera = pycolmap.Camera(
+                    camera_id=number * faces + k + 1,
+                    model=model,
+                    width=size[0],
+                    height=size[1],
+                    params=params,
+                )
+                camera.has_prior_focal_length = focal > 0
                 db.write_camera(camera, use_camera_id=True)
                 if k == 0:
                     rig.add_ref_sensor(camera.sensor_id)
@@ -92,7 +85,6 @@ def rigs(given: dict[str, Any], database: Path) -> None:
                     turned = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.zeros(3))
                     rig.add_sensor(camera.sensor_id, turned)
             db.write_rig(rig, use_rig_id=True)
-        names, camera_of = given["names"].tolist(), given["camera_of"].tolist()
         for start in range(0, len(names), faces):
             number = camera_of[start]
             frame = pycolmap.Frame(frame_id=start // faces + 1, rig_id=number + 1)
@@ -103,19 +95,6 @@ def rigs(given: dict[str, Any], database: Path) -> None:
                 db.write_image(image, use_image_id=True)
                 frame.add_data_id(image.data_id)
             db.write_frame(frame, use_frame_id=True)
-
-
-def _known(given: dict[str, Any]) -> list[tuple[float, tuple[int, int]]]:
-    """Focal length in px, 0 where it is not known, and size of each camera."""
-    return list(zip(given["focals"].tolist(), given["sizes"].tolist(), strict=True))
-
-
-def _camera(
-    number: int, model: str, size: tuple[int, int], focal: float, *distortion: float
-) -> pycolmap.Camera:
-    width, height = size
-    params = [focal, width / 2, height / 2, *distortion]
-    return pycolmap.Camera(camera_id=number, model=model, width=width, height=height, params=params)
 
 
 def extract(directory: Path, photos: Path, names: list[str], extraction: Any, database: Path) -> None:

@@ -34,7 +34,6 @@ from hqgs.scene.sfm.database import (
     match,
     new_cameras,
     pipeline_options,
-    rigs,
     table,
 )
 from hqgs.scene.sfm.facts import apart, borne_out, counts
@@ -94,8 +93,7 @@ class Work:
         if not path.exists():
             new = path.with_suffix(".new")
             new.unlink(missing_ok=True)
-            known = known_cameras if "Ks" in self.given else rigs
-            (known if self.fixed else new_cameras)(self.given, new)
+            (known_cameras if "Ks" in self.given else new_cameras)(self.given, new)
             new.rename(path)
         return path
 
