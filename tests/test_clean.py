@@ -122,11 +122,11 @@ def test_nothing_is_written_where_the_file_does_not_gain(
         return Cleaned(gaussians, 0, (80.0, 80.0), (80.0 + gain, 80.0 + gain))
 
     monkeypatch.setattr(cleaning, "clean", cleaned)
-    for name, words in (("new.ply", "does not pay, and"), ("new.splat", "does not pay as a .splat file")):
+    for name, words in (("new.ply", "does not pay, and"), ("new.splat", "do not improve as a .splat file")):
         assert main(["clean", str(tmp_path), "--out", str(tmp_path / name), "--steps", "9"]) == 1
         said = capsys.readouterr().err
         assert words in said
-        assert "nothing is written: 80.00 -> " in said
+        assert "nothing was written: 80.00 -> " in said
         assert not (tmp_path / name).exists()
     assert asked == [(9, (1.0, 0.5, 0.0))] * 2
     assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
@@ -145,7 +145,7 @@ def test_bad_input_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[s
     (tmp_path / "folder.ply").mkdir()
     foggy().save(file)
     for options, message in (
-        ([str(file), "--out", str(tmp_path / "new.ply")], "--photos names the photos"),
+        ([str(file), "--out", str(tmp_path / "new.ply")], "give --photos, a folder of photos"),
         ([str(file), "--out", str(file), "--photos", "embedded"], "what is removed would be lost"),
         ([str(file), "--out", str(tmp_path / "new.obj"), "--photos", "embedded"], "new.obj"),
         ([str(tmp_path / "no.ply"), "--out", str(tmp_path / "new.ply")], "no.ply"),

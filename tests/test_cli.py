@@ -169,7 +169,10 @@ def test_the_folder_of_the_photos_is_no_folder_for_a_run(
 ) -> None:
     (tmp_path / "a.jpg").write_bytes(b"")
     assert call("train", tmp_path, "--out", tmp_path / "." / "") == 2
-    assert one_line(capsys) == f"hqgs: --out {tmp_path} is the folder of the photos: name another for the run"
+    assert (
+        one_line(capsys)
+        == f"hqgs: --out {tmp_path} is the folder of the photos: name another folder for the run"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["a.jpg"]
 
 
@@ -181,8 +184,8 @@ def test_what_lies_in_the_folder_of_a_new_run_is_named_or_kept(
     options = ["train", "embedded", "--out", tmp_path, "--iterations", "2"]
     assert call(*options, "--resume") == 0
     first, second = capsys.readouterr().out.splitlines()[:2]
-    assert first == f"--resume: {tmp_path} holds no run to go on with; a new one begins"
-    assert second.startswith(f"--out {tmp_path} holds other files too (notes.txt, photos): ")
+    assert first == f"--resume: {tmp_path} holds no run; a new one starts"
+    assert second.startswith(f"--out {tmp_path} also holds other files (notes.txt, photos): ")
     assert call(*options, "--overwrite") == 0  # a run of ours
     assert "other files" not in capsys.readouterr().out
     for name in ("config.json", "photos/a.jpg"):
@@ -257,13 +260,15 @@ def test_a_run_goes_on_with_resume_only(
     assert call(*command, "--resume") == 0  # nothing there yet: starts
     capsys.readouterr()
     assert call(*command) == 2
-    assert one_line(capsys).startswith(f"hqgs: {tmp_path} holds a run; continue it with --resume, ")
+    assert one_line(capsys).startswith(f"hqgs: {tmp_path} holds a run: continue it with --resume, ")
     assert call(*command, "--resume") == 0
     capsys.readouterr()
     assert call(*command, "--resume", "--seed", "1") == 2
     assert "another seed: 0 there, 1 in this run" in one_line(capsys)
     assert call(*command[:-1], "19", "--resume") == 2
-    wanted = f"iterations is 19, and the run in {tmp_path} has 20: --resume can make it longer, not shorter"
+    wanted = (
+        f"iterations is 19, and the run in {tmp_path} has 20: --resume can make a run longer, not shorter"
+    )
     assert one_line(capsys) == f"hqgs: {wanted}"
     (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
     assert call(*command, "--resume") == 2
@@ -327,7 +332,7 @@ def test_a_run_that_cannot_go_on_is_exit_code_1(
 
     monkeypatch.setattr(ThreeDGS, "loss", broken)
     assert call("train", "embedded", "--out", tmp_path, "--method", "3dgs", "--iterations", "300") == 1
-    assert "was not finite in 20 steps in a row" in capsys.readouterr().err.splitlines()[-1]
+    assert "was NaN or Inf in 20 steps in a row" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_ctrl_c_is_exit_code_130_with_a_report(
@@ -427,9 +432,9 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
     assert "preparing" in time
     assert str(tmp_path / "report.html") in send
     assert send.endswith(
-        f"SuperSplat (superspl.at/editor) and other viewers of 3DGS files open {tmp_path / 'scene.ply'}"
+        f"SuperSplat (superspl.at/editor) and other 3DGS viewers open {tmp_path / 'scene.ply'}"
     )
-    assert now == f"now look at it: hqgs view {tmp_path}"
+    assert now == f"next, to see it: hqgs view {tmp_path}"
     assert call("info", tmp_path) == 0
     assert "3 of 3 iterations" in capsys.readouterr().out
     assert call("eval", tmp_path) == 0
@@ -474,9 +479,9 @@ def test_info_of_reports_that_are_none(
 @pytest.mark.parametrize(
     ("config", "told"),
     [
-        ('{"scene": {"path": "my photos"}}', "hqgs train 'my photos' --out {out} --resume goes on"),
-        ('{"scene": null}', "hqgs.train(..., resume=True) goes on"),
-        ("[1]", "hqgs.train(..., resume=True) goes on"),
+        ('{"scene": {"path": "my photos"}}', "hqgs train 'my photos' --out {out} --resume continues it"),
+        ('{"scene": null}', "hqgs.train(..., resume=True) continues it"),
+        ("[1]", "hqgs.train(..., resume=True) continues it"),
     ],
 )
 def test_info_of_a_run_that_was_killed(
@@ -485,7 +490,7 @@ def test_info_of_a_run_that_was_killed(
     (tmp_path / "config.json").write_text(config)
     (tmp_path / "checkpoint.safetensors").touch()
     assert call("info", tmp_path) == 0
-    assert f"a run that has not ended: {told.format(out=tmp_path)}" in capsys.readouterr().out
+    assert f"an unfinished run: {told.format(out=tmp_path)}" in capsys.readouterr().out
 
 
 def test_a_start_that_fails_leaves_no_folder(asked: list[dict[str, Any]], tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def told(clock: list[float], step: float, count: int, length: int, every: int = 
 def test_fast_steps_are_estimated_after_35(clock: list[float]) -> None:
     ((iteration, text),) = told(clock, 0.05, 100, 1000)
     assert iteration == 36
-    assert text.startswith("1,000 iterations, 20.0 a second now: about 48 s to 2 min")
+    assert text.startswith("1,000 iterations, 20.0 per second now: training takes about 48 s to 2 min")
 
 
 def test_slow_steps_are_estimated_after_a_few(clock: list[float]) -> None:

@@ -302,7 +302,7 @@ def test_a_new_view_in_the_look_of_a_photo(tmp_path: Path, capsys: pytest.Captur
     assert main(["render", str(out / "scene.ply"), "--out", str(tmp_path / "x.png"), "--look", "view1"]) == 0
     wrong = ["--show", "depth", "--look", "view1"]
     assert main(["render", str(out), "--out", str(tmp_path / "x.png"), *wrong]) == 2
-    assert "--look is of colours, and --show is depth" in capsys.readouterr().err
+    assert "--look is for --show color, and --show is depth" in capsys.readouterr().err
     for record in report["learned"]:
         record |= {"gains": [1.0] * 3, "vignetting": [0.0] * 2, "response": [[0.1] * 3, [0.0] * 3]}
     (out / "report.json").write_text(json.dumps(report))

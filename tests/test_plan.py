@@ -235,4 +235,4 @@ def test_photos_alone_have_a_plan_as_far_as_it_goes(
     assert main(["plan", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "noise:2" in said
-    assert "not known before the photos have poses" in said
+    assert "not known before hqgs train has found the poses" in said

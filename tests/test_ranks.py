@@ -160,7 +160,7 @@ def test_torchrun(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
     done = subprocess.run([*torchrun, *train], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("looking at the photos") == 1
+    assert done.stdout.count("measuring the photos") == 1
     assert main(["train", *arguments, "--out", str(tmp_path / "one")]) == 0
     assert (tmp_path / "one" / PLY).read_bytes() == (tmp_path / "two" / PLY).read_bytes()
     capsys.readouterr()

@@ -129,7 +129,7 @@ def test_a_bare_file_gets_an_orbit(folder: Path, tmp_path: Path) -> None:
     [
         (["--views", "nobody"], "--views: the run has no photo 'nobody'; there are: train, test, all, view0"),
         (["--path", "no.json"], "--path is 'no.json': no such file, and none of: cameras, orbit"),
-        (["--up", "0", "0", "1"], "--up is of an orbit (--path orbit); a way through the cameras looks"),
+        (["--up", "0", "0", "1"], "--up is for an orbit (--path orbit); a path through the cameras is level"),
         (["--frames", "0"], "frames is 0, wanted at least 1"),
         (["--fps", "fast"], "--fps is fast, wanted a number"),
         (["--fps", "0"], "fps is 0.0, wanted a number above 0"),
@@ -142,7 +142,7 @@ def test_a_bare_file_gets_an_orbit(folder: Path, tmp_path: Path) -> None:
         (["--out", "a.mp4"], "no PyAV"),
         (["--out", "a.mp4", "--size", "1", "8"], "a film has sides of at least 2 px, these are 1 x 8"),
         (["--look", "nobody"], "{folder}: no gains, vignetting or response of photos were learned"),
-        (["--look", "view0", "--show", "depth"], "--look is of colours, and --show is depth"),
+        (["--look", "view0", "--show", "depth"], "--look is for --show color, and --show is depth"),
         (["--views", "train", "--out", "x.png"], "x.png holds one picture, and there are 5"),
     ],
 )

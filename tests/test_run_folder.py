@@ -205,10 +205,10 @@ def test_a_run_that_left_a_photo_out_is_measured_without_it(
         found = judged(tmp_path, source, "--photos", photos)
         assert found["protocol"]["names"] == judged(tmp_path, run)["protocol"]["names"]
     said = capsys.readouterr().err
-    assert "held out by --test-every, though the run was trained on them" not in said
+    assert "--test-every holds out photos that the run was trained on" not in said
     judged(tmp_path, run, "--photos", photos, "--test-every", "4")
     said = capsys.readouterr().err
-    assert "held out by --test-every, though the run was trained on them: images/view_04" in said
+    assert "--test-every holds out photos that the run was trained on: images/view_04" in said
 
 
 def test_each_file_of_a_run_is_shown_before_its_background(
@@ -275,7 +275,7 @@ def test_a_plan_is_of_all_photos(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (facts.photos, facts.pixels) == (35, 35 * 24 * 32)
     assert main(["plan", str(tmp_path / "photos")]) == 0
     told = capsys.readouterr().out
-    assert "photos: 35 photos to train on (16 of them looked at), 0 points" in told
+    assert "photos: 35 photos to train on (16 of them measured), 0 points" in told
     assert "a diagnosis of 19 of 35 training photos" in str(hqgs.diagnose(scene))
     assert pictures(tmp_path / "photos").of == 40
 
@@ -313,7 +313,7 @@ def test_options_of_a_path_are_refused_with_views(
     save_cameras(tmp_path, tiny)
     command = ["render", str(tmp_path), "--views", "test", "--out", str(tmp_path / "a"), *option]
     assert main(command) == 2
-    assert f"{option[0]} is of paths, and --views has the run's own cameras" in capsys.readouterr().err
+    assert f"{option[0]} is for paths, and --views uses the photos' cameras" in capsys.readouterr().err
 
 
 def test_a_run_of_before_has_learned_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -39,7 +39,7 @@ def test_a_configuration_comes_back_from_its_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"iteration": 3}, "there is no field 'iteration'; there are: iterations, method"),
+        ({"iteration": 3}, "unknown field 'iteration'; there are: iterations, method"),
         ({"iterations": "many"}, "iterations is 'many', wanted int"),
         ({"iterations": True}, "iterations is True, wanted int"),
         ({"densify": {"every": 0}}, "every is 0, wanted at least 1"),
@@ -135,7 +135,7 @@ def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["train", "x", "--out", "y", "--device", "cuda"], "there is no --device: hqgs trains on the CPU"),
+        (["train", "x", "--out", "y", "--device", "cuda"], "there is no --device: hqgs runs on the CPU"),
         (["train", "x", "--out", "y", "--iterations", "many"], "--iterations is many, wanted a whole number"),
         (["train", "x", "--out", "y", "--foo", "1", "2"], "there is no option --foo (hqgs train --help)"),
         (

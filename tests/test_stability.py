@@ -175,7 +175,7 @@ def test_a_mistake_in_the_catalogue_is_named(tmp_path: Path, monkeypatch: pytest
     for text, message in (
         (
             'a = [{ name = "b", why = "c", firts = { means = [0.0, 0.0, 1.0] } }]',
-            "'b': there is no field 'firts'",
+            "'b': unknown field 'firts'",
         ),
         ('a = [{ name = "b" }]', "'b': .* missing 1 required .*: 'why'"),
         ('a = [{ name = "b", why = "c", culled = [0.5] }]', r"'b': culled\[0\] is 0.5, wanted int"),

@@ -181,7 +181,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     g.save(tmp_path / "alone.ply")
     call = ["render", str(tmp_path / "alone.ply"), "--show", "trust", "--out", str(tmp_path / "a.png")]
     assert cli.main(call) == 2
-    assert "has no cameras.json and photos/" in capsys.readouterr().err
+    assert "has neither cameras.json and photos/" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.glb", "a.full.ply", "a.spz", "a.sog", "a.splat"])
@@ -201,13 +201,13 @@ def test_files_hold_it_or_say_that_they_do_not(
         assert back.errors is not None
         assert torch.equal(back.errors, torch.cat([errors[:3], errors[4:]]))
         assert cli.main(["info", str(tmp_path / name)]) == 0
-        assert "the error of what each shows" in capsys.readouterr().out
+        assert "it has an error for each Gaussian" in capsys.readouterr().out
         maps = ["render", str(tmp_path / name), "--show", "trust", "--out", str(tmp_path / "map.png")]
         assert cli.main([*maps, "--size", "40", "30"]) == 0
         back.save(tmp_path / "again.ply")
         assert torch.equal(Gaussians.load(tmp_path / "again.ply").errors, back.errors)  # type: ignore[arg-type]
     else:
-        assert f"--trust: a .{name[2:]} file has no place for it; .ply and .glb files have" in told.err
+        assert f"--trust: a .{name[2:]} file cannot store it; .ply and .glb files can" in told.err
         g.errors = errors
         g.save(tmp_path / "with.ply")
         assert cli.main(["export", str(tmp_path / "with.ply"), "--out", str(tmp_path / name)]) == 0

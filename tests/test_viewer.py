@@ -421,7 +421,7 @@ def test_train_shows_its_page_and_stays(
     assert cli.main(command) == 0
     told = capsys.readouterr().out
     assert told.count("look at http://127.0.0.1:") == 2
-    assert "now look at it" not in told
+    assert "next, to see it" not in told
     assert cli.main([*command, "--resume"]) == 0  # without a step
     assert shown == [True, True]
 

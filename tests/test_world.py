@@ -139,7 +139,7 @@ def test_what_is_written_is_in_the_frame_of_the_files(
         assert (pictures(scene, read) - wanted).abs().max() < (2e-5 if exact else 0.1)
         assert (tmp_path / f"{name}.world.json").exists() == (name not in ("a.ply", "a.glb"))
     assert main(["info", str(tmp_path / "a.spz")]) == 0
-    told = re.search(r"lie in x, y, z: \S+ to \S+, (\S+) to ", capsys.readouterr().out)
+    told = re.search(r"lie within x, y, z: \S+ to \S+, (\S+) to ", capsys.readouterr().out)
     assert told is not None
     assert float(told[1]) == pytest.approx(UTM[1], rel=0.01)
     vertices = PlyData.read(str(tmp_path / "a.ply"))["vertex"]

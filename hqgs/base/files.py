@@ -63,7 +63,7 @@ def _where_there_is(what: str) -> Iterator[None]:
     except OSError as error:
         if error.errno not in _LACKING:
             raise
-        _say_once(f"the file system lacks {what} ({error.strerror}): going on without")
+        _say_once(f"the file system has no {what} ({error.strerror}): hqgs continues without")
 
 
 @lru_cache
@@ -144,18 +144,20 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
         raise FileExistsError(
-            f"{folder} is a file, and cannot be the folder of a run: choose another"
+            f"{folder} is a file, not a folder: choose another folder for the run"
         ) from None
     except PermissionError as error:
-        raise PermissionError(f"no right to write into {error.filename}: choose another folder") from None
+        raise PermissionError(
+            f"no permission to write into {error.filename}: choose another folder"
+        ) from None
     lock = FileLock(folder / LOCK)
     try:
-        with _where_there_is(f"locks, in {folder}: let no other run write there"):
+        with _where_there_is(f"file locks in {folder}: do not let another run write there"):
             lock.acquire(timeout=0)
     except Timeout:
         raise FolderBusyError(f"another run is writing into {folder}") from None
     except PermissionError:
-        raise PermissionError(f"no right to write into {folder}: choose another folder") from None
+        raise PermissionError(f"no permission to write into {folder}: choose another folder") from None
     try:
         yield
     finally:

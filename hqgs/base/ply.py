@@ -39,7 +39,7 @@ def header_of(path: Path) -> Header:
         head = f.read(MAX_HEADER_BYTES)
     end = _END.search(head)
     if not head.startswith(b"ply") or end is None:
-        raise ValueError(f"{path}: not a PLY file (no header that ends within {MAX_HEADER_BYTES} bytes)")
+        raise ValueError(f"{path}: not a PLY file (no end of a header within {MAX_HEADER_BYTES} bytes)")
     return Header(head[: end.start()].decode("latin-1").splitlines(), end.end(), head[: end.end()].isascii())
 
 

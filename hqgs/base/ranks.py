@@ -231,7 +231,7 @@ def _heard(rank: int, call: Callable[[], T]) -> T:
     try:
         return call()
     except RuntimeError as error:
-        silent = f"was silent for {SILENCE:.0f} s" if "imed out" in str(error) else "has gone"
+        silent = f"did not answer for {SILENCE:.0f} s" if "imed out" in str(error) else "has gone"
         raise RankError(f"rank {rank} {silent}: it was stopped, or its machine was cut off") from error
 
 

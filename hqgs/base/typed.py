@@ -22,7 +22,7 @@ def build(kind: type[T], values: Any, where: str, base: T | None = None) -> T:
     found: dict[str, Any] = {}
     for name, value in values.items():
         if name not in known:
-            raise ValueError(f"{where}: there is no field {name!r}; there are: {', '.join(known)}")
+            raise ValueError(f"{where}: unknown field {name!r}; there are: {', '.join(known)}")
         found[name] = _value(hints[name], value, f"{where}: {name}", getattr(base, name, None))
     try:
         return kind(**found) if base is None else replace(base, **found)  # type: ignore[type-var]

@@ -27,15 +27,15 @@ class Clean:
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """The folder of a run, or a scene file of this or another program."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
-    """The scene file to write; nothing is written where held-out photos do not gain."""
+    """The scene file to write; it is written only if renders of held-out photos improve."""
     photos: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
-    """The photos with their cameras, in the frame of the scene file (those that the run was trained on)."""
+    """Photos with their cameras, in the frame of the scene file (those of the run)."""
     downscale: Factor = None
-    """Divide the sides of the photos of --photos by F."""
+    """Divide width and height of the photos of --photos by F."""
     test_every: Number = None
-    """Hold out every N-th photo of --photos (as the run did; 8, unless the scene has a split)."""
+    """Hold out every N-th photo of --photos (as the run did; else 8, unless the scene has a split)."""
     steps: Number = None
-    """Training views to see (600)."""
+    """Number of training views to render (600)."""
 
 
 OPTIONS = Clean
@@ -50,7 +50,9 @@ def run(options: Clean) -> int:
         check_above(options.out)
         source = check_source(options.source, options.photos)
         if options.out.exists() and options.out.samefile(source):
-            raise ValueError(f"--out is the source {source} itself; what is removed would be lost")
+            raise ValueError(
+                f"--out is the source {source} itself: name another file, or what is removed would be lost"
+            )
         from hqgs.evaluation.run_folder import RunFolder  # here: they load torch
         from hqgs.model.gaussians import Gaussians
         from hqgs.training.cleaning import CLEANING_STEPS, check_steps, clean, held_out_psnrs
@@ -72,11 +74,15 @@ def run(options: Clean) -> int:
         written = replace(done, after=held_out_psnrs(back.in_world(scene.world), scene, background))
         words = gained(written)
         if not written.pays:
-            lossy = f" as a .{format} file, which holds less of it" if done.pays else ""
+            lossy = f" as a .{format} file, which is less exact" if done.pays else ""
             held = (
-                "" if options.photos is None else " (photos that the scene was trained on cannot show a gain)"
+                ""
+                if options.photos is None
+                else " (photos that the scene was trained on cannot show an improvement)"
             )
-            return fail(1, f"{source}: cleaning does not pay{lossy}, and nothing is written: {words}{held}")
+            return fail(
+                1, f"{source}: held-out photos do not improve{lossy}; nothing was written: {words}{held}"
+            )
         cleaned.save(options.out)
     except BAD_INPUT as error:
         return fail(2, error)
@@ -85,14 +91,14 @@ def run(options: Clean) -> int:
     tell_read(gaussians)
     for what in left_out(gaussians, cleaned, back, format):
         print(f"left out: {what}")
-    print(f"{options.out}: {words}; {done.removed:,} of {len(gaussians):,} Gaussians faded and are gone")
+    print(f"{options.out}: {words}; {done.removed:,} of {len(gaussians):,} Gaussians were removed")
     return 0
 
 
 def gained(done: Cleaned) -> str:
     """What held-out photos say of it."""
     if not done.pairs:
-        return "no held-out photo has a PSNR"
+        return "no held-out photo could be measured"
     before, after = (sum(pair[k] for pair in done.pairs) / len(done.pairs) for k in (0, 1))
     photos = f"{len(done.pairs)} held-out photos ({done.gain:+.2f} ± {done.interval:.2f})"
     return f"{before:.2f} -> {after:.2f} dB on {photos}"
@@ -104,11 +110,11 @@ def left_out(source: Gaussians, cleaned: Gaussians, back: Gaussians, format: str
 
     found = list[str]()
     if source.antialiased and not FORMATS[format].antialiased:
-        found.append(f"the antialias flag: a .{format} file has no place for it")
+        found.append(f"the antialias flag: a .{format} file cannot store it")
     if back.sh_degree < source.sh_degree:
-        found.append(f"harmonics above degree {back.sh_degree}: a .{format} file has no place for them")
+        found.append(f"harmonics above degree {back.sh_degree}: a .{format} file cannot store them")
     if lost := len(cleaned) - len(back):
-        found.append(f"{lost:,} Gaussians that a .{format} file cannot hold")
+        found.append(f"{lost:,} Gaussians that a .{format} file cannot store")
     if source.errors is not None:
-        found.append("the error of what each Gaussian shows: it was measured before")
+        found.append("the errors of the Gaussians (trust): measured before cleaning, no longer valid")
     return found

@@ -21,10 +21,10 @@ class Degrade(Photos):
     """Options of `hqgs degrade`."""
 
     out: Folder
-    """Folder for the new scene; missing or empty."""
-    kind: Annotated[str, tyro.conf.arg(metavar="KIND", help=f"What happens to the training photos: {KINDS}.")]
+    """New or empty folder for the new scene."""
+    kind: Annotated[str, tyro.conf.arg(metavar="KIND", help=f"How to degrade the training photos: {KINDS}.")]
     seed: Annotated[int, tyro.conf.arg(metavar="S")] = 0
-    """Of everything random."""
+    """Seed of all random numbers (0)."""
 
 
 OPTIONS = Degrade

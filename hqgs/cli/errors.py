@@ -19,7 +19,7 @@ BAD_INPUT = (
 
 
 _WORDS = {
-    errno.EEXIST: "is there already: choose another name",
+    errno.EEXIST: "exists already: choose another name",
     errno.EACCES: "cannot be read or written: you have no right to",
     errno.EPERM: "cannot be read or written: you have no right to",
     errno.ENOENT: "is not there",

@@ -39,19 +39,19 @@ class ExportScene:
         tyro.conf.arg(metavar="FORMAT", help_behavior_hint="", help=f"{', '.join(WRITTEN)} (as FILE ends)."),
     ] = None
     sh_degree: Annotated[int, tyro.conf.arg(metavar="D")] = DEFAULTS.sh_degree
-    """Of the harmonics, at most."""
+    """Highest degree of the spherical harmonics (as the scene needs)."""
     sh_bits: Annotated[tuple[int, int], values("B B", "two whole numbers", int, int)] = DEFAULTS.sh_bits
-    """SPZ: of the harmonics of degree 1, and of degrees 2 and 3."""
+    """SPZ: bits of the harmonics of degree 1, and of degrees 2 and 3."""
     spz_version: Annotated[int, tyro.conf.arg(metavar="V")] = DEFAULTS.spz_version
-    """SPZ: 3, which more programs read, or 4, which is smaller and which newer ones ask for."""
+    """SPZ: version 3, which most programs read, or 4, which is smaller and which newer programs need."""
     band_tolerance: Annotated[float, tyro.conf.arg(metavar="T")] = DEFAULTS.band_tolerance
-    """Harmonics that change a colour by no more are left out; white is 1."""
+    """Leave out harmonics that change colours by at most this; white is 1."""
     trust: Flag = False
-    """Also write the error of what each Gaussian shows, by the photos of the run: PLY, glTF."""
+    """Also write the error of each Gaussian, measured by the photos of the run: PLY, glTF."""
     scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
     """Measure the file on the held-out photos of this scene."""
     downscale: Factor = None
-    """Divide the sides of those photos by F."""
+    """Divide width and height of those photos by F."""
 
 
 OPTIONS = ExportScene
@@ -71,10 +71,12 @@ def run(args: ExportScene) -> int:
         source = scene_file(args.source)
         check_above(args.out)
         if args.out.exists() and args.out.samefile(source):
-            raise ValueError(f"--out is the source {source} itself; what is left out would be lost")
+            raise ValueError(
+                f"--out is the source {source} itself: name another file, or what is left out would be lost"
+            )
         if args.trust and not FORMATS[options.format].errors:
             places = " and ".join(f".{name}" for name, format in FORMATS.items() if format.errors)
-            raise ValueError(f"--trust: a .{options.format} file has no place for it; {places} files have")
+            raise ValueError(f"--trust: a .{options.format} file cannot store it; {places} files can")
         from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
         from hqgs.evaluation.run_folder import RunFolder
         from hqgs.model.gaussians import Gaussians
@@ -120,7 +122,7 @@ def run(args: ExportScene) -> int:
 def _check_together(args: ExportScene, format: str) -> None:
     """ValueError for options that another one leaves without effect."""
     if args.downscale is not None and args.scene is None:
-        raise ValueError("--downscale divides the photos of --scene, and there is no --scene")
+        raise ValueError("--downscale is for the photos of --scene: give --scene too")
     for name in ("sh_bits", "spz_version"):
         if format != "spz" and getattr(args, name) != getattr(DEFAULTS, name):
             asked = f"--out {args.out}" if args.format is None else "--format"

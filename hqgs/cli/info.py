@@ -64,8 +64,12 @@ def _file(path: Path) -> list[str]:
     return [
         f"{path}: {len(gaussians):,} Gaussians, harmonics of degree {gaussians.sh_degree}, "
         f"{path.stat().st_size / 1e6:.3g} MB",
-        f"nine tenths of them lie in x, y, z: {box}",
-        *(["the error of what each shows: hqgs render --show trust"] if gaussians.errors is not None else []),
+        f"90 % of them lie within x, y, z: {box}",
+        *(
+            ["it has an error for each Gaussian: hqgs render --show trust shows them"]
+            if gaussians.errors is not None
+            else []
+        ),
         *(f"read: {note}" for note in gaussians.notes),
     ]
 
@@ -84,9 +88,9 @@ def _run(path: Path) -> list[str] | None:
 def _not_ended(path: Path) -> str:
     origin = RunFolder(path).loaded.get("path")
     if origin is None:
-        return f"{path}: a run that has not ended: hqgs.train(..., resume=True) goes on"
+        return f"{path}: an unfinished run: hqgs.train(..., resume=True) continues it"
     command = shlex.join(["hqgs", "train", str(origin), "--out", str(path), "--resume"])
-    return f"{path}: a run that has not ended: {command} goes on"
+    return f"{path}: an unfinished run: {command} continues it"
 
 
 def _told(run: RunFolder, report: Any) -> list[str]:
@@ -121,12 +125,12 @@ def _photos(path: Path) -> list[str]:
     sizes = sorted(set(photos.sizes))
     guess = photos.guess()
     focal = sum(exif.focal > 0 for exif in photos.exif)
-    poses = ", ".join(formats) if formats else "none yet: hqgs train and hqgs sfm find them"
+    poses = ", ".join(formats) if formats else "none yet; hqgs train and hqgs sfm find them by COLMAP"
     lines = [
         f"{root}: {len(photos.names)} photos of {', '.join(f'{w} x {h}' for w, h in sizes[:4])} px"
         + (" and other sizes" if len(sizes) > 4 else ""),
-        f"cameras: {len(guess.sizes)}; EXIF tells the focal length of {focal} photos, and that "
-        f"{sum(exif.quarter_turns > 0 for exif in photos.exif)} lie on their side",
+        f"cameras: {len(guess.sizes)}; EXIF has the focal length of {focal} photos, and says that "
+        f"{sum(exif.quarter_turns > 0 for exif in photos.exif)} are stored on their side",
         f"poses: {poses}",
     ]
     others = beside(root, photos.folder) if formats else []  # they are read

@@ -33,21 +33,21 @@ class Judge:
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """A scene file of this or another program, or the folder of a run."""
     photos: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
-    """The photos with their cameras, in the frame of the scene file (those that the run was trained on)."""
+    """Photos with their cameras, in the frame of the scene file (those of the run)."""
     against: Annotated[Path | None, tyro.conf.arg(metavar="OTHER", help_behavior_hint="")] = None
-    """Another scene of the same photos, or the judge.json of one, to compare with."""
+    """Another scene of the same photos to compare with, or its judge.json."""
     views: Annotated[str, tyro.conf.arg(metavar="WHICH")] = "test"
-    """The photos to measure on: test (held out), train, all, or names with commas."""
+    """Photos to measure on: test (held out), train, all, or names separated by commas."""
     test_every: Number = None
-    """Hold out every N-th photo of --photos (as the run did; 8, unless the scene has a split)."""
+    """Hold out every N-th photo of --photos (as the run did; else 8, unless the scene has a split)."""
     downscale: Factor = None
-    """Divide the sides of the photos by F (a longer side of at most 1600 px)."""
+    """Divide width and height of the photos by F (the longer side becomes 1600 px at most)."""
     background: Color = None
-    """Behind everything; 1 is white (that of the run, or black)."""
+    """Background colour R G B; 1 is white (that of the run, or black)."""
     fit_cameras: bool = False
-    """Also measure with each camera fitted to the scene, some 10 s a photo: what poses cost is set aside."""
+    """Also measure with each pose refined to the scene, about 10 s a photo: shows what pose errors cost."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None
-    """Also write judge.json and judge.html, a page with photos against renders, into this folder."""
+    """Also write judge.json and judge.html, a page of photos beside renders, into this folder."""
 
 
 OPTIONS = Judge
@@ -107,7 +107,7 @@ def run(options: Judge) -> int:
         return fail(1, f"{options.out or options.source}: {error}")
     print(told(found))
     if options.out is not None:
-        print(f"\n{options.out / PAGE}: photos against renders, and where the errors are")
+        print(f"\n{options.out / PAGE}: photos beside renders, and where the errors are")
     return 0
 
 
@@ -119,8 +119,8 @@ def check_source(source: Path, photos: str | None) -> Path:
     format_of(file)
     if photos is None and not (source.is_dir() and (source / CONFIG).is_file()):
         raise ValueError(
-            f"{source} is no folder of a run: --photos names the photos to measure it with, in a folder with "
-            "their cameras (COLMAP, nerfstudio, ...)"
+            f"{source} is no folder of a run: give --photos, a folder of photos with their cameras (COLMAP, "
+            "nerfstudio, ...) to measure it with"
         )
     ready(str(source) if photos is None else photos)
     return file

@@ -31,20 +31,20 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "train": Command("hqgs.cli.train", "photos, or a film, to a scene and a report"),
-    "sfm": Command("hqgs.cli.sfm", "photos, or a film, to cameras and points (COLMAP)"),
+    "train": Command("hqgs.cli.train", "make a scene and a report from photos or a film"),
+    "sfm": Command("hqgs.cli.sfm", "find cameras and points of photos or a film (COLMAP)"),
     "judge": Command(
-        "hqgs.cli.judge", "say how good a run, or any scene file, is, how sure that is, and why"
+        "hqgs.cli.judge", "measure how good a run or a scene file is, and what causes its errors"
     ),
     "eval": Command("hqgs.cli.judge", "the same as judge"),
-    "render": Command("hqgs.cli.render", "pictures and films of a trained scene"),
-    "view": Command("hqgs.cli.view", "look at a scene in a browser (train --view: while it trains)"),
-    "export": Command("hqgs.cli.export", "write a smaller scene file, with what the scene needs"),
-    "plan": Command("hqgs.cli.plan", "say what a run would be, and why, without training"),
-    "clean": Command("hqgs.cli.clean", "remove fog and shards between the photos, of any scene file"),
-    "diagnose": Command("hqgs.cli.diagnose", "say what degraded photos"),
+    "render": Command("hqgs.cli.render", "make pictures and films of a scene"),
+    "view": Command("hqgs.cli.view", "show a scene in a browser (train --view: while it trains)"),
+    "export": Command("hqgs.cli.export", "write a smaller scene file, or another format"),
+    "plan": Command("hqgs.cli.plan", "print the settings that a run would use, and why, without training"),
+    "clean": Command("hqgs.cli.clean", "remove floaters from a scene file"),
+    "diagnose": Command("hqgs.cli.diagnose", "measure blur, noise, JPEG compression and exposure of photos"),
     "degrade": Command("hqgs.cli.degrade", "write a scene with degraded training photos"),
-    "info": Command("hqgs.cli.info", "say what a run, a scene file or a folder of photos holds"),
+    "info": Command("hqgs.cli.info", "print what a run, a scene file or a folder of photos holds"),
 }
 
 

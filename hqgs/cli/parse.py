@@ -41,7 +41,7 @@ HOME = re.compile(r"^(--[\w-]+=)?(~(?:/.*)?)$", re.DOTALL)  # which the shell le
 def parse(options: type[T], command: str, about: str, arguments: Sequence[str], default: Any = None) -> T:
     """The options that the arguments give. Help and mistakes end the program, mistakes with one sentence."""
     if asked := [a for a in arguments if a.split("=")[0] in GPU]:
-        raise SystemExit(fail(2, f"there is no {asked[0]}: hqgs trains on the CPU, leave it out"))
+        raise SystemExit(fail(2, f"there is no {asked[0]}: hqgs runs on the CPU; leave this option out"))
     if asked := [a for a in arguments if a in OF_3DGS]:
         raise SystemExit(fail(2, f"there is no {asked[0]}: write hqgs train PHOTOS --out RUN"))
     arguments = [f" {a}" if POINT.match(a) else a for a in arguments]  # else -1,2,3 would be an option

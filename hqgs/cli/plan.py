@@ -24,9 +24,9 @@ class PlanOptions(TrainOptions, Photos):
     """Options of `hqgs plan`."""
 
     test_every: Number = None
-    """As that of train."""
+    """Hold out every N-th photo, as in hqgs train."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), Unsaid] = None
-    """Folder of a run on these photos, whose poses are used."""
+    """Folder of a run on these photos; its poses are used."""
 
 
 OPTIONS = PlanOptions
@@ -38,9 +38,7 @@ def run(options: PlanOptions) -> int:
         config = options.resolved()
         posed = options.out is not None and (options.out / KEPT).exists()
         if options.out is not None and not posed and not is_run(options.out):
-            raise ValueError(
-                f"--out {options.out}: there is no run; without --out the plan is that of a new one"
-            )
+            raise ValueError(f"--out {options.out}: there is no run; leave --out away to plan a new run")
         ready(options.scene)
         from hqgs.scene.source import finding, load, pictures  # here: they load torch
         from hqgs.training.frame import Frame
@@ -71,12 +69,12 @@ def run(options: PlanOptions) -> int:
     except BAD_INPUT as error:
         return fail(2, error)
     photos = f"{scene.of or len(scene.train)} photos to train on"
-    looked = f" ({len(scene.train)} of them looked at)" if scene.of not in (None, len(scene.train)) else ""
+    looked = f" ({len(scene.train)} of them measured)" if scene.of not in (None, len(scene.train)) else ""
     print(f"{scene.name}: {photos}{looked}, {len(scene.points):,} points")
     print(plan)
     if later:
         print(
-            f"not known before the photos have poses, which hqgs train finds: {', '.join(later)}, and what "
-            "photos share (exposure, shake, focus)"
+            f"not known before hqgs train has found the poses: {', '.join(later)}, and what needs points "
+            "that photos share (exposure, shake, focus)"
         )
     return 0

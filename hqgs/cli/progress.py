@@ -147,9 +147,9 @@ class TrainingScreen(Screen):
             self._told = True
             step, left = (now.seconds - seconds) / (now.iteration - start), now.length - now.iteration
             self.say(
-                f"{now.length:,} iterations, {1 / step:.1f} a second now: about {duration(left * step)} to "
-                f"{duration(_SLOWER * left * step)}, as steps get slower while the scene grows, and the "
-                "evaluations. Ctrl-C ends it at any time with a whole scene"
+                f"{now.length:,} iterations, {1 / step:.1f} per second now: training takes about "
+                f"{duration(left * step)} to {duration(_SLOWER * left * step)} (steps slow down as Gaussians "
+                "are added), plus evaluations. Ctrl-C stops at any time and writes the scene"
             )
 
 

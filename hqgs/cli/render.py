@@ -37,26 +37,25 @@ class Render:
     out: Annotated[Path, tyro.conf.arg(metavar="PATH")]
     """PATH.mp4, PATH.gif, PATH.png, or a folder for pictures."""
     views: Annotated[str | None, tyro.conf.arg(metavar="WHICH", help_behavior_hint="")] = None
-    """The run's own views in place of a path: train, test, all, or names with commas."""
+    """Render the photos' views instead of a path: train, test, all, or names separated by commas."""
     path: Annotated[str, tyro.conf.arg(metavar="KIND")] = PATHS[0]
-    """cameras (a smooth way through the training cameras, cut where they leap), orbit, or the JSON file of a
-    camera path, of the viewer or of nerfstudio. A scene file without cameras gets an orbit."""
+    """cameras (a smooth path through the training cameras, with cuts at large gaps), orbit, or the JSON file
+    of a camera path by the viewer or nerfstudio. A scene file without cameras gets an orbit."""
     frames: Number = None
-    """Frames of a path that is made here (240)."""
+    """Number of frames, for cameras and orbit (240)."""
     fps: Factor = None
     """Frames per second (30, or what the path file says)."""
     size: Size = None
-    """In pixels (as the cameras have)."""
+    """Size in pixels (as the cameras have)."""
     show: Annotated[str, choice("color", "depth", "alpha", "trust"), Unsaid] = "color"
-    """What the pictures show (color). trust: the error that 9 of 10 pixels stay below, by the run's
-    photos."""
+    """What to render (color). trust: an error bound that 9 of 10 pixels stay below, by the run's photos."""
     look: Annotated[str | None, tyro.conf.arg(metavar="PHOTO", help_behavior_hint="")] = None
-    """In the look of this photo of the run: its gains, its camera's vignetting and response, where those were
-    learned (that of the mean photo)."""
+    """Render with the exposure of this photo of the run, and its camera's vignetting and response, if they
+    were learned (the mean of all photos)."""
     background: Color = None
-    """Behind everything; 1 is white (that of the run, or black)."""
+    """Background colour R G B; 1 is white (that of the run, or black)."""
     up: Vector = None
-    """Where up is, of an orbit (that of the cameras, or what the scene file says; else 0 -1 0)."""
+    """Up direction of an orbit (that of the cameras or of the scene file; else 0 -1 0)."""
 
 
 OPTIONS = Render
@@ -117,9 +116,11 @@ def _check(options: Render, run: RunFolder) -> None:
     of_paths["up"] = options.up is not None
     for name, given in of_paths.items():
         if options.views is not None and given:
-            raise ValueError(f"--{name} is of paths, and --views has the run's own cameras: give one of them")
+            raise ValueError(
+                f"--{name} is for paths, and --views uses the photos' cameras: give only one of them"
+            )
     if options.look is not None and options.show != "color":
-        raise ValueError(f"--look is of colours, and --show is {options.show}")
+        raise ValueError(f"--look is for --show color, and --show is {options.show}")
     if options.background is not None:
         check_background(options.background)
     check_above(options.out)
@@ -134,7 +135,7 @@ def _check_folder(run: RunFolder, out: Path) -> None:
     path = run.loaded.get("path")
     own = path is not None and out.resolve() in (Path(path), Path(path, "images"))
     if photos := [name for name in held if own or not PICTURE.fullmatch(name)]:
-        raise ValueError(f"--out {out} holds photos ({some(photos)}): name another folder for pictures")
+        raise ValueError(f"--out {out} holds photos ({some(photos)}): name another folder for the renders")
 
 
 def _cameras(
@@ -151,15 +152,15 @@ def _cameras(
     count = FRAMES if frames is None else frames
     if views is not None:
         if known is None:
-            raise ValueError(f"{source} has no cameras.json, which says what its views are; use --path orbit")
+            raise ValueError(f"{source} has no cameras.json, so its views are unknown: use --path orbit")
         held = {kind: [view for view in known.views if view.held_out == kind] for kind in (False, True)}
         chosen = picked(held[False], held[True], views, "the run")
         return [_file_name(k, v.name) for k, v in enumerate(chosen)], [v.camera for v in chosen], FPS
     if path not in PATHS:
         if frames is not None:
-            raise ValueError("--frames is for paths that are made here; a path file has its own")
+            raise ValueError("--frames is for cameras and orbit; a path file has its own frames")
         if options.up is not None:
-            raise ValueError("--up is of an orbit; a path file has its own directions")
+            raise ValueError("--up is for an orbit; a path file has its own directions")
         if not Path(path).is_file():
             raise FileNotFoundError(f"--path is {path!r}: no such file, and none of: {', '.join(PATHS)}")
         own, rate = load_path(path)
@@ -167,7 +168,9 @@ def _cameras(
     if known is None or not known.train:
         return None, orbit(gaussians, count, up=options.up or gaussians.world.up or UP), FPS
     if options.up is not None and path != "orbit":
-        raise ValueError("--up is of an orbit (--path orbit); a way through the cameras looks as they do")
+        raise ValueError(
+            "--up is for an orbit (--path orbit); a path through the cameras is level as they are"
+        )
     up = known.up if options.up is None else options.up
     made = orbit(known.train, count, up=up) if path == "orbit" else camera_path(known.train, count, cuts=True)
     return None, made, FPS
@@ -180,15 +183,15 @@ def _trust(options: Render, gaussians: Gaussians, run: RunFolder) -> Trust:
     known = gaussians.along(run.cameras)
     if known is None and gaussians.errors is None:
         raise ValueError(
-            f"--show trust: {options.source} has no cameras.json and photos/, as a run has, nor errors "
-            "of its Gaussians, as hqgs export --trust writes"
+            f"--show trust: {options.source} has neither cameras.json and photos/, as a run has, nor errors "
+            "of its Gaussians, which hqgs export --trust writes"
         )
     trust = trust_of(gaussians, known)
     measured = measure_trust(trust)
     if measured is not None:
         print(f"trust: {measured}")
     elif known is not None:
-        print("trust: not calibrated, as the run held out no photo: bounds are those of other captures")
+        print("trust: not calibrated, as the run held out no photo: error bounds are those of other captures")
     return trust
 
 

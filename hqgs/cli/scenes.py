@@ -36,13 +36,13 @@ SceneName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 
 @dataclass(frozen=True, kw_only=True)
 class Photos:
-    """Which photos, and at which size."""
+    """The photos, and their size."""
 
     scene: SceneName
-    """A folder with photos, a film, a scene that other programs made (COLMAP, LLFF, nerfstudio, ...), or
-    embedded, a room that is built in."""
+    """A folder with photos, a film, a scene of another program (COLMAP, LLFF, nerfstudio, ...), or embedded,
+    a built-in room."""
     downscale: Factor = None
-    """Divide the photos' sides by F."""
+    """Divide width and height of the photos by F."""
 
 
 def ready(scene: str) -> None:
@@ -118,7 +118,7 @@ def measured_scene(
     if photos is None:
         if downscale is not None or test_every is not None:
             raise ValueError(
-                f"{source} is measured on its own photos: another size or split needs them named"
+                f"{source} is measured on the photos of its run: --downscale and --test-every need --photos"
             )
         return run.photos(screen.stage)
     bare = film_at(photos) is not None or not (
@@ -126,8 +126,8 @@ def measured_scene(
     )
     if bare and not run.config:
         raise ValueError(
-            f"{photos} has no cameras: those that would be found anew are in another frame than {source}; "
-            "give the COLMAP or nerfstudio folder that it was trained on"
+            f"{photos} has no cameras, and newly found ones would not be in the frame of {source}: give the "
+            "COLMAP or nerfstudio folder that it was trained on"
         )
     scene = load(
         photos,
@@ -146,7 +146,7 @@ def measured_scene(
     if test_every is None:
         return split
     if seen := sorted({view.name for view in scene.test} & {view.name for view in split.train}):
-        screen.say(f"held out by --test-every, though the run was trained on them: {some(seen)}")
+        screen.say(f"warning: --test-every holds out photos that the run was trained on: {some(seen)}")
     return scene
 
 
@@ -168,16 +168,18 @@ def check_out(out: Path, scene: str, resume: bool, overwrite: bool) -> list[str]
         if resume or overwrite:
             return []
         raise FileExistsError(
-            f"{out} holds a run; continue it with --resume, begin anew with --overwrite, or choose another "
+            f"{out} holds a run: continue it with --resume, start again with --overwrite, or choose another "
             "--out"
         )
     if out.is_dir() and Path(scene).is_dir() and out.samefile(scene):
-        raise ValueError(f"--out {out} is the folder of the photos: name another for the run")
+        raise ValueError(f"--out {out} is the folder of the photos: name another folder for the run")
     if out.exists() and not out.is_dir():
         raise ValueError(f"--out {out} is a file: name a folder for the run")
-    lines = [f"--resume: {out} holds no run to go on with; a new one begins"] if resume else []
+    lines = [f"--resume: {out} holds no run; a new one starts"] if resume else []
     if others := strangers(out):
-        lines.append(f"--out {out} holds other files too ({some(others)}): those of the run go beside them")
+        lines.append(
+            f"--out {out} also holds other files ({some(others)}): the run writes its files beside them"
+        )
     return lines
 
 
@@ -199,4 +201,4 @@ def check_above(out: Path) -> None:
     """ValueError where `--out` would lie below a file."""
     above = next(path for path in out.absolute().parents if path.exists())
     if not above.is_dir():
-        raise ValueError(f"--out {out} lies below {above}, which is a file")
+        raise ValueError(f"--out {out} is inside {above}, which is a file, not a folder")

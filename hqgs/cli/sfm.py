@@ -18,9 +18,9 @@ class Sfm:
     scene: SceneName
     """A folder with photos, or a film."""
     out: Folder
-    """Folder for the scene; missing or empty. It gets images and sparse/0, as COLMAP names them."""
+    """New or empty folder for the scene. It gets the folders images and sparse/0 of COLMAP."""
     frames: Number = None
-    """Frames to take from a film (two a second, 30 to 90)."""
+    """Number of frames to take from a film (two per second, from 30 to 90)."""
 
 
 WORK = ".sfm"  # in the new folder, while COLMAP works
@@ -40,12 +40,12 @@ def run(options: Sfm) -> int:
                 options.scene, options.out, options.out / WORK, options.frames, screen.stage
             )
     except KeyboardInterrupt:
-        return fail(130, "stopped; the same command goes on with what COLMAP has found")
+        return fail(130, "stopped; the same command continues with what COLMAP has found")
     except BAD_INPUT as error:
         return fail(2, error)
     except OSError as error:
         return fail(1, f"{options.out}: {error}")
     print(report)
     print(f"{options.out}: images and sparse/0, by COLMAP in {duration(screen.colmap_seconds)}")
-    print(f"now: hqgs train {options.out} --out RUN")
+    print(f"next: hqgs train {options.out} --out RUN")
     return 0

@@ -38,40 +38,40 @@ if TYPE_CHECKING:
     from hqgs.training.progress import Progress
 
 EXPERT = "--config."
-VIEWERS = "SuperSplat (superspl.at/editor) and other viewers of 3DGS files"
+VIEWERS = "SuperSplat (superspl.at/editor) and other 3DGS viewers"
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Into(Photos):
     out: Folder
-    """Folder for the scene, the report and what is needed to go on."""
+    """Folder for the scene, the report and the checkpoint."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Train(PhotoOptions, TrainOptions, _Into):
-    """Options of `hqgs train`. None: as the preset, the file of --config or the resumed run says."""
+    """Options of `hqgs train`. Default: as the preset, the file of --config or the resumed run says."""
 
     resume: Flag = False
-    """Go on with the run in DIR; with a larger --iterations also where it has come to its end."""
+    """Continue the run in DIR; a finished run needs a larger --iterations."""
     overwrite: Flag = False
-    """Begin anew in a folder that holds a run."""
+    """Start again in a folder that holds a run."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Unsaid] = None
-    """Train with the configuration in this file: config.json of another run."""
+    """Train with the configuration of another run: its config.json."""
     plan: Annotated[Path | None, tyro.conf.arg(metavar="RUN"), Unsaid] = None
-    """Repeat what the seconds of another run came to, bit for bit: its folder, or its plan.json."""
+    """Repeat a run with --seconds bit for bit: its folder, or its plan.json."""
     view: Flag = False
     """Show the scene in a browser while it trains, and afterwards until Ctrl-C."""
     port: Port = PORT
     open: Open = False
     threads: Number = None
-    """CPU threads (all cores; the result does not depend on it)."""
+    """CPU threads (all cores); the result does not depend on them."""
     help_all: Flag = False
-    """Show every number of the training too: --config.densify.grad-threshold and so on."""
+    """Also show the options for every number of the training, such as --config.densify.grad-threshold."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Whole(Train):
-    """With every number of the configuration."""
+    """All options, with every number of the configuration."""
 
     expert: Annotated[TrainConfig, tyro.conf.arg(name="config")] = field(default_factory=TrainConfig)
 
@@ -96,7 +96,7 @@ def read(options: type[Train], command: str, about: str, arguments: Sequence[str
 def config_of(options: Train) -> TrainConfig:
     """The configuration that the options ask for. ValueError for a bad one."""
     if len(given := [n for n in ("iterations", "seconds", "plan") if getattr(options, n) is not None]) > 1:
-        raise ValueError(f"only one of --{' and --'.join(given)} can be given")
+        raise ValueError(f"give only one of --{' and --'.join(given)}")
     before = _before(options)
     file = options.config or (None if before is None else before.folder)
     kept = None if file is None else read_config(file)
@@ -107,7 +107,7 @@ def config_of(options: Train) -> TrainConfig:
         if shorter and before is not None and options.config is None:
             raise ValueError(
                 f"iterations is {asked.iterations}, and the run in {options.out} has {kept.iterations}: "
-                "--resume can make it longer, not shorter"
+                "--resume can make a run longer, not shorter"
             )
     return asked if options.plan is None else with_plan(asked, options.plan)
 
@@ -129,8 +129,8 @@ def run(options: Train) -> int:
             done, live, screen, bar, loaded = _train(options, ranks)
     except KeyboardInterrupt:
         if (out / CHECKPOINT).exists():
-            return fail(130, "stopped at once; --resume goes on from the last checkpoint")
-        found = " The same command goes on with what COLMAP has found" if (out / KEPT).exists() else ""
+            return fail(130, "stopped at once; --resume continues from the last checkpoint")
+        found = " The same command continues with what COLMAP has found" if (out / KEPT).exists() else ""
         return fail(130, f"stopped before the first checkpoint.{found}")
     except BAD_INPUT as error:
         return fail(2, error)
@@ -146,7 +146,8 @@ def run(options: Train) -> int:
     if not done.finished:
         command = shlex.join(["hqgs", "train", options.scene, "--out", str(out), "--resume"])
         print(
-            f"stopped at iteration {done.iterations} of {done.length}; go on with: {command}", file=sys.stderr
+            f"stopped at iteration {done.iterations} of {done.length}; continue with: {command}",
+            file=sys.stderr,
         )
     if live is not None:
         live.stay() if done.finished else live.close()
@@ -203,7 +204,7 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
     length = f"at most {config.iterations:,} iterations"
     if options.seconds is not None:
         length = f"{duration(options.seconds)} of training"
-    print(f"looking at the photos, then {length}", flush=True)
+    print(f"measuring the photos, then {length}", flush=True)
     live = None
     if options.view and ranks.first:
         live = LiveView(scene, options.out, port=options.port, open_browser=options.open)
@@ -265,6 +266,6 @@ def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:
     if fell := overdone(done.history):
         print(fell)
     print(f"time: {times.told(colmap)}")
-    print(f"to send: {out / PAGE}, which any browser opens; {VIEWERS} open {out / PLY}")
+    print(f"to share: {out / PAGE} opens in any browser; {VIEWERS} open {out / PLY}")
     if not options.view:
-        print(f"now look at it: {shlex.join(['hqgs', 'view', str(out)])}")
+        print(f"next, to see it: {shlex.join(['hqgs', 'view', str(out)])}")

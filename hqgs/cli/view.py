@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 EVERY = 2.0  # seconds between copies of the scene while it trains
 
 
-Port = Annotated[int, tyro.conf.arg(metavar="P", help="Of the page: the first port to try; 0: any.")]
+Port = Annotated[int, tyro.conf.arg(metavar="P", help="Port of the page: the first one to try; 0: any.")]
 Open = Annotated[bool, tyro.conf.arg(help_behavior_hint="", help="Open the page in this machine's browser.")]
 
 
@@ -137,7 +137,7 @@ class LiveView:
 
 
 def _tell(url: str, open_browser: bool) -> None:
-    print(f"look at {url} in a browser of this machine; Ctrl-C ends it", flush=True)
+    print(f"open {url} in a browser on this machine; Ctrl-C ends it", flush=True)
     if elsewhere():
         print(ELSEWHERE.format(port=url.rsplit(":", 1)[-1]), flush=True)
     if open_browser:

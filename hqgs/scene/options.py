@@ -12,9 +12,7 @@ from hqgs.base.options import Apart, Factor, Flag, Number, Unsaid, Vector
 from hqgs.photos.formula import grammar
 from hqgs.scene.constants import TEST_EVERY
 
-KINDS = (
-    f"{grammar()}, some:KIND (half of the photos only), several joined by + in their order, mixed, or none"
-)
+KINDS = f"{grammar()}, some:KIND (only half of the photos), several steps joined by +, mixed, or none"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,25 +20,27 @@ class PhotoOptions:
     """As users give them; None: not said. `hqgs.load` says more of each."""
 
     downscale: Factor = None
-    """Divide the photos' sides by F (as the preset says)."""
+    """Divide width and height of the photos by F (as the preset says)."""
     test_every: Number = None
-    """Hold out every Nth photo to measure with (8, unless the scene has a split); 0: train on all photos."""
+    """Hold out every N-th photo to measure with (8, unless the scene has a split); 0: train on all photos."""
     sfm: Flag = False
-    """Cameras and points from the training photos, by COLMAP, where the scene has some already."""
+    """Find cameras and points from the training photos by COLMAP, even if the scene has some."""
     frames: Number = None
-    """Frames to take from a film (two a second, 30 to 90)."""
+    """Number of frames to take from a film (two per second, from 30 to 90)."""
     distance: Apart = None
     """Metres between the cameras of the photos A and B, or points x,y,z: the scene is written in metres."""
     up: Vector = None
-    """Where up is, in the frame of the photos' cameras (as upright edges, GPS or EXIF tell it)."""
+    """Up direction in the frame of the photos' cameras (from upright edges, GPS or EXIF)."""
     degrade: Annotated[
         str | None,
         tyro.conf.arg(
-            metavar="KIND", help=f"What happens to the training photos: {KINDS}.", help_behavior_hint=""
+            metavar="KIND",
+            help=f"Degrade the training photos, for experiments: {KINDS}.",
+            help_behavior_hint="",
         ),
     ] = None
     restore: Annotated[Path | None, tyro.conf.arg(metavar="WEIGHTS"), Unsaid] = None
-    """Send the training photos through this restoration network first."""
+    """Restore the training photos with this network first (a file of weights)."""
 
     def said(self) -> dict[str, Any]:
         """Those that were said, as JSON values."""
