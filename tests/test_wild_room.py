@@ -11,14 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks.scenes import wild
-from benchmarks.scenes.exposure import Exposure, path_viewmats, shaken, spread, still, through_lens
+from benchmarks.scenes.exposure import path_viewmats, render_exposure, shaken, spread, still, through_lens
 from benchmarks.scenes.shake import path_points
 from benchmarks.scenes.sparse import TABLE, sparse_cameras, sparse_room
 from benchmarks.scenes.wild import DISTANCE, TRUE_KINDS, PhotoTruth, parse_true_kind, wild_room
-from hqgs.scene.builtin import scene, shading
+from hqgs.scene.builtin import scene
 from hqgs.scene.builtin.scene import embedded_cameras, surface_points
-from hqgs.scene.builtin.shading import render_depth, render_exposure, render_view, sample_pattern
-from hqgs.scene.builtin.studio import studio
+from hqgs.scene.builtin.shading import render_depth, render_view, sample_pattern
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.sfm.triangulated import SparsePoints
 
@@ -105,7 +104,7 @@ def test_a_shaken_photo_is_the_mean_of_frames() -> None:
     photo = render_exposure(shaken(camera, knots, count))
     times = (np.arange(count) + 0.5) / count - 0.5
     frames = [
-        shading.render_exposure(still(replace(camera, viewmat=viewmat), offset[None]))
+        render_exposure(still(replace(camera, viewmat=viewmat), offset[None]))
         for viewmat, offset in zip(path_viewmats(camera.viewmat, knots, times), spread(count), strict=True)
     ]
     expected = np.mean([light(frame) for frame in frames], 0)
@@ -155,24 +154,6 @@ def test_gains_are_on_the_light() -> None:
         assert slope == pytest.approx(gains[c], rel=0.01)
 
 
-@pytest.mark.parametrize("kind", ["shake", "lens"])
-def test_culling_changes_nothing(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    camera, knots = small_camera(11), knots_of(5, 0.06)
-    made: dict[str, Exposure] = {
-        "shake": shaken(camera, knots, 10),
-        "lens": through_lens(camera, 0.1, 2.0, 10),
-    }
-    photo = render_exposure(made[kind])
-    monkeypatch.setattr(
-        shading, "in_view", lambda corners, eye, rays: np.ones((len(corners), len(rays)), bool)
-    )
-    loose = replace(studio())
-    bound = np.full((len(loose.casters), 3), np.inf)
-    loose.__dict__["lamp_boxes"] = (-bound, bound)
-    monkeypatch.setattr(shading, "studio", lambda: loose)
-    np.testing.assert_array_equal(render_exposure(made[kind]), photo)
-
-
 def test_same_bytes_at_any_thread_count() -> None:
     made = shaken(embedded_cameras(100, 75)[5], knots_of(6), 4)
     first = render_exposure(made, threads=1)
@@ -186,7 +167,7 @@ def test_same_bytes_at_any_thread_count() -> None:
 def quick(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Points without COLMAP; counts the photos that are rendered."""
     rendered: list[int] = []
-    real = shading.render_exposure
+    real = render_exposure
 
     def cast(views: list[View]) -> SparsePoints:
         return surface_points(views, 300)._replace(note="cast")

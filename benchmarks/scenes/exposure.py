@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +11,55 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.scenes.shake import exposure_times, path_points
 from hqgs.photos.formation import GOLDEN
-from hqgs.scene.builtin.shading import Exposure
+from hqgs.scene.builtin.shading import encode, render_light, to_bytes
 from hqgs.scene.scene import Camera
 
 Floats = NDArray[np.float64]
+
+
+class Device(Protocol):
+    """What a camera does to all its photos."""
+
+    def shade(self, camera: Camera) -> Floats:
+        """What arrives of the light at each pixel, [H, W]."""
+        ...
+
+    def respond(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Values [..., 3] of 0..1 as this camera writes them."""
+        ...
+
+
+class Exposure(NamedTuple):
+    """A photo as the mean of samples, each through a camera of its own, or all through one: sample s of a
+    pixel is the ray of `cameras[s]` through the pixel's corner + `jitter[s]`."""
+
+    cameras: Sequence[Camera]  # 1 or S
+    jitter: Floats  # [S, 2], x and y in the unit square
+
+
+def render_exposure(
+    exposure: Exposure, gains: Floats | None = None, threads: int | None = None, device: Device | None = None
+) -> NDArray[np.uint8]:
+    """Photo of the embedded scene, [H, W, 3] sRGB: the mean of an exposure's samples in linear light.
+
+    `gains` [3] of red, green and blue are applied to the light, before the camera's curve, which is the same
+    in all photos: it rolls off the highlights and encodes sRGB. `device`: whose lens darkens the light, and
+    whose response follows the curve. `threads` as in `render_view`.
+    """
+    first, *others = exposure.cameras
+    if others:
+        light = np.zeros((first.height, first.width, 3), np.float32)
+        for camera, offset in zip(exposure.cameras, exposure.jitter, strict=True):
+            light += render_light(camera, offset[None], threads)
+        light /= np.float32(len(exposure.jitter))
+    else:
+        light = render_light(first, exposure.jitter, threads)
+    if gains is not None:
+        light *= gains.astype(np.float32)
+    if device is not None:
+        light = light * device.shade(first).astype(np.float32)[..., None]
+    values = encode(light)
+    return to_bytes(values if device is None else device.respond(values))
 
 
 def still(camera: Camera, jitter: Floats) -> Exposure:
@@ -37,21 +83,15 @@ def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> E
     """
     k = np.arange(count)
     radii, angles = aperture * np.sqrt((k + 0.5) / count), GOLDEN * k
-    hexagon = np.arange(6.0) * math.pi / 3
-    around = aperture / math.cos(math.pi / 6)  # the hexagon encloses the lens
-
-    def pinholes(radii: NDArray[np.floating], angles: NDArray[np.floating]) -> list[Camera]:
-        points = np.stack([radii * np.cos(angles), radii * np.sin(angles)], -1)
-        cameras = []
-        for x, y in points - points.mean(axis=0):  # a sunflower of few seeds is off its middle
-            viewmat, K = camera.viewmat.copy(), camera.K.copy()
-            viewmat[:2, 3] -= x, y
-            K[0, 2] += K[0, 0] * x / focus
-            K[1, 2] += K[1, 1] * y / focus
-            cameras.append(Camera(camera.width, camera.height, K, viewmat))
-        return cameras
-
-    return Exposure(pinholes(radii, angles), spread(count), pinholes(np.full(6, around), hexagon))
+    points = np.stack([radii * np.cos(angles), radii * np.sin(angles)], -1)
+    pinholes = []
+    for x, y in points - points.mean(axis=0):  # a sunflower of few seeds is off its middle
+        viewmat, K = camera.viewmat.copy(), camera.K.copy()
+        viewmat[:2, 3] -= x, y
+        K[0, 2] += K[0, 0] * x / focus
+        K[1, 2] += K[1, 1] * y / focus
+        pinholes.append(Camera(camera.width, camera.height, K, viewmat))
+    return Exposure(pinholes, spread(count))
 
 
 def path_viewmats(viewmat: Floats, knots: Floats, times: Floats) -> Floats:

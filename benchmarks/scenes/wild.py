@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.scenes.devices import Device, draw_devices
-from benchmarks.scenes.exposure import Exposure, shaken, still, through_lens
+from benchmarks.scenes.exposure import Exposure, render_exposure, shaken, still, through_lens
 from benchmarks.scenes.kinds import draw_gains
 from benchmarks.scenes.shake import draw_path, draw_strength, knots_mean, path_extent, path_length
 from hqgs.photos.formula import Kind
 from hqgs.scene.builtin.scene import FOCUS, HEIGHT, WIDTH, embedded_scene, keep, kept
-from hqgs.scene.builtin.shading import render_exposure, sample_pattern
+from hqgs.scene.builtin.shading import sample_pattern
 from hqgs.scene.scene import Camera, Scene
 
 Floats = NDArray[np.float64]

@@ -268,18 +268,15 @@ def nearest(
 ) -> tuple[Array, NDArray[np.int16]]:
     """First hit along each ray: t (inf: none) and the index of the surface (-1: none).
 
-    d: three [B, S, n] of rays in B blocks; o: three floats or arrays that broadcast to them. Surface k is
-    tried where `blocks` [N, B] is True.
+    o: three floats; d: three [B, S, n] of rays in B blocks. Surface k is tried where `blocks` [N, B] is True.
     """
-    single = np.ndim(o[0]) == 0 or len(o[0]) == 1  # origins for all blocks
     t = np.full_like(d[0], np.inf)
     index = np.full(t.shape, -1, np.int16)
     for k, surface in enumerate(surfaces):
         chosen = np.flatnonzero(blocks[k])
         if not len(chosen):
             continue
-        near = o if single else (o[0][chosen], o[1][chosen], o[2][chosen])
-        hit = surface.hit(near, (d[0][chosen], d[1][chosen], d[2][chosen]))
+        hit = surface.hit(o, (d[0][chosen], d[1][chosen], d[2][chosen]))
         before = t[chosen]
         closer = hit < before
         t[chosen] = np.where(closer, hit, before)

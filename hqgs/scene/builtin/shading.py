@@ -1,63 +1,21 @@
-"""Light, and the public renderers: `render_view` and `render_exposure` (photos), `render_depth`.
-
-The benchmarks make photos as life makes them by it: by moving cameras, lenses and devices.
-"""
+"""Light, and the public renderers: `render_view` (photos), `render_light` and `render_depth`."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.base.evenly import evenly
 from hqgs.photos.light import to_srgb
 from hqgs.scene.builtin.raycast import Array, Surface, Vec, along, dot, in_view, nearest
 from hqgs.scene.builtin.studio import Studio, studio
 from hqgs.scene.scene import Camera
 
 TILE, BLOCK = 64, 8  # pixels: a tile is one job; each surface is tried on the blocks that it may cover
-OUTLINES = 8  # cameras that stand for all when a tile asks what it may see
-MARGIN = 2.0  # px that a tile looks beyond its border for the cameras between them
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """A photo as the mean of samples, each through a camera of its own, or all through one.
-
-    Sample s of a pixel is the ray of `cameras[s]` through the pixel's corner + `jitter[s]`.
-    """
-
-    cameras: Sequence[Camera]  # 1 or S
-    jitter: NDArray[np.float64]  # [S, 2], x and y in the unit square
-    outline: Sequence[Camera] = ()  # whose views enclose those of all samples; none: they are found
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the photo."""
-        return self.cameras[0].width, self.cameras[0].height
-
-    def seen_from(self) -> tuple[Sequence[Camera], float]:
-        """Cameras whose views, widened by as many px, enclose what all samples see."""
-        if len(self.cameras) == 1:
-            return self.cameras, 0.0
-        return self.outline or [self.cameras[k] for k in evenly(len(self.cameras), OUTLINES)], MARGIN
-
-
-class Device(Protocol):
-    """What a camera does to all its photos."""
-
-    def shade(self, camera: Camera) -> NDArray[np.float64]:
-        """What arrives of the light at each pixel, [H, W]."""
-        ...
-
-    def respond(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Values [..., 3] of 0..1 as this camera writes them."""
-        ...
 
 
 def render_view(camera: Camera, samples: int = 3, threads: int | None = None) -> NDArray[np.uint8]:
@@ -69,40 +27,21 @@ def render_view(camera: Camera, samples: int = 3, threads: int | None = None) ->
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    return render_exposure(Exposure([camera], sample_pattern(samples)), threads=threads)
+    return to_bytes(encode(render_light(camera, sample_pattern(samples), threads)))
 
 
-def render_exposure(
-    exposure: Exposure,
-    gains: NDArray[np.float64] | None = None,
-    threads: int | None = None,
-    device: Device | None = None,
-) -> NDArray[np.uint8]:
-    """Photo of the embedded scene, [H, W, 3] sRGB: the mean of an exposure's samples in linear light.
-
-    `gains` [3] of red, green and blue are applied to the light, before the camera's curve, which is the same
-    in all photos: it rolls off the highlights and encodes sRGB. `device`: whose lens darkens the light, and
-    whose response follows the curve. `threads` as in `render_view`.
-    """
-    width, height = exposure.size
-    image = np.empty((height, width, 3), np.uint8)
-    shade = None if device is None else device.shade(exposure.cameras[0]).astype(np.float32)
-    factor = None if gains is None else gains.astype(np.float32)
+def render_light(
+    camera: Camera, jitter: NDArray[np.float64], threads: int | None = None
+) -> NDArray[np.float32]:
+    """Linear light of the embedded scene, [H, W, 3]: the mean of samples, rays through each pixel's corner +
+    `jitter` [S, 2], x and y in the unit square; `threads` as in `render_view`."""
+    light = np.empty((camera.height, camera.width, 3), np.float32)
 
     def work(tile: _Tile) -> None:
-        light = _render_tile(tile)
-        if factor is not None:
-            light *= factor
-        light = tile.picture(light)
-        if shade is not None:
-            light = light * shade[tile.rows, tile.cols, None]
-        values = _encode(light)
-        if device is not None:
-            values = device.respond(values)
-        image[tile.rows, tile.cols] = (values * 255 + 0.5).astype(np.uint8)
+        light[tile.rows, tile.cols] = tile.picture(_render_tile(tile))
 
-    _each_tile(exposure, np.float32, work, threads)
-    return image
+    _each_tile(camera, jitter, np.float32, work, threads)
+    return light
 
 
 def render_depth(camera: Camera) -> NDArray[np.float64]:
@@ -116,7 +55,7 @@ def render_depth(camera: Camera) -> NDArray[np.float64]:
         t, _ = nearest(tile.seen, tile.blocks, tile.eye, tile.d)
         depth[tile.rows, tile.cols] = tile.picture(t[:, 0])
 
-    _each_tile(Exposure([camera], np.full((1, 2), 0.5)), np.float64, work, None)
+    _each_tile(camera, np.full((1, 2), 0.5), np.float64, work, None)
     return depth
 
 
@@ -132,31 +71,27 @@ def sample_pattern(n: int) -> NDArray[np.float64]:
 class _Tile:
     """The rays of up to TILE x TILE pixels, in B blocks of S samples of n = BLOCK^2 pixels: [B, S, n]."""
 
-    def __init__(self, exposure: Exposure, x: int, y: int, dtype: type, scene: Studio) -> None:
-        self.scene, self.jitter = scene, exposure.jitter
-        width, height = (min(TILE, side - at) for side, at in zip(exposure.size, (x, y), strict=True))
+    def __init__(
+        self, camera: Camera, jitter: NDArray[np.float64], x: int, y: int, dtype: type, scene: Studio
+    ) -> None:
+        self.scene, self.jitter = scene, jitter
+        width, height = (min(TILE, side - at) for side, at in ((camera.width, x), (camera.height, y)))
         self.rows, self.cols = slice(y, y + height), slice(x, x + width)
         self.grid = (-(-height // BLOCK), -(-width // BLOCK))  # the last blocks may reach past the picture
         row, col = (a.reshape(-1, 1) * BLOCK for a in np.indices(self.grid))
         i, j = (a.reshape(-1) for a in np.indices((BLOCK, BLOCK)))
         px, py = (x + col + j)[:, None], (y + row + i)[:, None]
-        self.eye, directions = _rays(
-            exposure.cameras, px + self.jitter[:, :1], py + self.jitter[:, 1:], dtype
-        )
+        center = camera.center
+        self.eye: Vec = (float(center[0]), float(center[1]), float(center[2]))
+        directions = _directions(camera, px + jitter[:, :1], py + jitter[:, 1:])
         dx, dy, dz = (a.astype(dtype) for a in directions)
         self.d: Vec = (dx, dy, dz)
-
-        cameras, margin = exposure.seen_from()
         square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
         def meets(corners: NDArray[np.float64], left: Any, top: Any, side: int) -> NDArray[np.bool_]:
-            """Which boxes, corners [N, 8, 3], the cameras may see in squares at pixels [B, 1]; [N, B]."""
-            xs = left - margin + (side + 2 * margin) * square[:, 0]
-            ys = top - margin + (side + 2 * margin) * square[:, 1]
-            found = np.zeros((len(corners), len(xs)), bool)
-            for camera in cameras:
-                found |= in_view(corners, camera.center, np.stack(_directions(camera, xs, ys), -1))
-            return found
+            """Which boxes, corners [N, 8, 3], the camera may see in squares at pixels [B, 1]; [N, B]."""
+            rays = _directions(camera, left + side * square[:, 0], top + side * square[:, 1])
+            return in_view(corners, center, np.stack(rays, -1))
 
         tile = np.zeros((1, 1), np.int64)
         visible = np.flatnonzero(meets(self.scene.corners, x + tile, y + tile, TILE))
@@ -178,33 +113,17 @@ def _directions(camera: Camera, x: NDArray[Any], y: NDArray[Any]) -> list[NDArra
     return [R[0, k] * a + R[1, k] * b + R[2, k] for k in range(3)]
 
 
-def _rays(
-    cameras: Sequence[Camera], x: NDArray[Any], y: NDArray[Any], dtype: type
-) -> tuple[Vec, list[NDArray[np.float64]]]:
-    """Origins and world directions, as `_directions`, of the samples at x, y [B, S, n].
-
-    Origins are numbers for one camera, otherwise arrays [1, S, 1].
-    """
-    if len(cameras) == 1:
-        center = cameras[0].center
-        return (float(center[0]), float(center[1]), float(center[2])), _directions(cameras[0], x, y)
-
-    def gather(values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Of each sample, [S, ...], as [..., 1, S, 1]."""
-        return np.moveaxis(np.stack(values), 0, -1)[..., None, :, None]
-
-    K, R = (gather([getattr(camera, what) for camera in cameras]) for what in ("K", "viewmat"))
-    a, b = (x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]
-    ox, oy, oz = gather([camera.center for camera in cameras]).astype(dtype)
-    return (ox, oy, oz), [R[0, k] * a + R[1, k] * b + R[2, k] for k in range(3)]
-
-
-def _each_tile(exposure: Exposure, dtype: type, work: Callable[[_Tile], None], threads: int | None) -> None:
+def _each_tile(
+    camera: Camera,
+    jitter: NDArray[np.float64],
+    dtype: type,
+    work: Callable[[_Tile], None],
+    threads: int | None,
+) -> None:
     """Run `work` on fixed tiles that cover the picture; the tiles do not depend on the threads."""
-    width, height = exposure.size
+    width, height, skew = camera.width, camera.height, camera.K[0, 1]
     if width < 1 or height < 1:
         raise ValueError(f"camera must be at least 1 x 1 pixels, got {width} x {height}")
-    skew = exposure.cameras[0].K[0, 1]
     if skew != 0:
         raise ValueError(f"camera.K must have skew 0, got {skew}")
     if threads is not None and threads < 1:
@@ -214,7 +133,7 @@ def _each_tile(exposure: Exposure, dtype: type, work: Callable[[_Tile], None], t
 
     def job(corner: tuple[int, int]) -> None:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # rays parallel to a side
-            work(_Tile(exposure, *corner, dtype, scene))
+            work(_Tile(camera, jitter, *corner, dtype, scene))
 
     corners = [(x, y) for y in range(0, height, TILE) for x in range(0, width, TILE)]
     with ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1)) as pool:  # more would wait for Python
@@ -341,8 +260,13 @@ def _surroundings(scene: Studio, r: Vec) -> Array:
     return color + scene.key * (3 * pane)[:, None]
 
 
-def _encode(linear: Array) -> Array:
+def encode(linear: Array) -> Array:
     """Roll off the highlights above 0.7 and apply the sRGB curve; [0, inf) to [0, 1]."""
     over = np.maximum(linear - 0.7, 0)
     x = np.minimum(linear, 0.7) + 0.3 * over / (over + 0.3)
     return to_srgb(x)
+
+
+def to_bytes(values: Array) -> NDArray[np.uint8]:
+    """Values of 0..1 as a photo stores them."""
+    return (values * 255 + 0.5).astype(np.uint8)
