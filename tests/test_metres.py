@@ -109,7 +109,7 @@ def test_a_photo_may_be_named_without_folder_suffix_or_case(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ((A, "view_66.png", 1.0), r"no photo with a camera is called 'view_66.png'.* is view_0?6"),
+        ((A, "view_66.png", 1.0), r"no photo with a camera is called 'view_66.png'.* are view_0?6"),
         ((A, A, 1.0), "both photos are 'view_01.png'; name two"),
         ((A, "view_01", 1.0), "are both the photo view_01.png"),
         ((A, B, 0.0), "0 m between view_01.png and view_06.png; it must be more than 0"),

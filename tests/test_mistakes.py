@@ -48,7 +48,7 @@ MISTAKES = {
     f"{TRAIN} --degrade jpg:10": "unknown degradation 'jpg'; there are: jpeg, ",
     f"{TRAIN} --degrade jpeg:1000": "jpeg is 1000, wanted a quality, an integer in 1..95",
     f"{TRAIN} --distance view_00.png 2": "Missing value for argument '--distance'. Expected 3 values.",
-    f"{TRAIN} --distance view_00 view_77 2": "no photo with a camera is called 'view_77'; the most similar",
+    f"{TRAIN} --distance view_00 view_77 2": "no photo with a camera is called 'view_77', or several are",
     f"{TRAIN} --up 0 0 0": "up is [0.0, 0.0, 0.0], wanted three numbers x, y, z that are not all 0",
     f"{TRAIN} --frames 9": "frames is for films, and {root}/scene is none: each of its photos is used",
     f"{TRAIN} --test-every 1": "all 9 views are test views, none is left to train on",

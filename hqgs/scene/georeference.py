@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +72,10 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
     if np.ptp(gps[:, 1]) > 180:  # on both sides of the date line
         gps = np.column_stack([gps[:, 0], gps[:, 1] % 360, gps[:, 2]])
     start = np.median(gps, axis=0)
-    target = _enu(gps, start)
+    from pycolmap import GPSTransform  # here: to read a scene does not need it
+
+    earth = GPSTransform()
+    target = np.asarray(earth.ellipsoid_to_enu(gps, *start))
     if len(target) < 3 * GPS_LEAST:  # so few that every one counts
         found = similarity(centers, target), np.ones(len(target), bool)
     else:
@@ -101,7 +103,7 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
     sure = float(stdtrit(3 * count - 7, 0.975)) * error
     flat, free = scale * turned[:, :2], count - 7 / 3
     tilt = math.sqrt(2 * fdtri(2, free, 0.95) * axes[2] * np.trace(np.linalg.pinv(flat.T @ flat)) / 2)
-    north, east, above = _geodetic(shift, start)
+    north, east, above = np.asarray(earth.enu_to_ellipsoid(shift[None], *start))[0].tolist()
     return Georeference(
         scale=scale,
         interval=[max(scale - sure, 0.0), scale + sure],
@@ -114,33 +116,3 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
         spread=spread,
         tilt=math.degrees(tilt),
     )
-
-
-def _earth() -> Any:
-    import pycolmap  # here: to read a scene does not need it
-
-    return pycolmap.GPSTransform()
-
-
-def _ecef(gps: Array) -> Array:
-    """Geocentric metres [N, 3] of degrees north, degrees east and metres of height [N, 3]."""
-    return np.asarray(_earth().ellipsoid_to_ecef(gps))
-
-
-def _axes(start: Array) -> Array:
-    """East, north and up at a place, as rows [3, 3] in the geocentric frame."""
-    north, east = np.radians(start[:2])
-    s, c, se, ce = np.sin(north), np.cos(north), np.sin(east), np.cos(east)
-    return np.array([[-se, ce, 0], [-s * ce, -s * se, c], [c * ce, c * se, s]])
-
-
-def _enu(gps: Array, start: Array) -> Array:
-    """Metres east, north and up of `start`, [N, 3]."""
-    return (_ecef(gps) - _ecef(start[None])) @ _axes(start).T
-
-
-def _geodetic(enu: Array, start: Array) -> tuple[float, float, float]:
-    """Degrees north and east, and metres of height, of a point [3] in metres from `start`."""
-    at = _ecef(start[None]) + enu @ _axes(start)
-    north, east, up = np.asarray(_earth().ecef_to_ellipsoid(at))[0].tolist()
-    return north, east, up

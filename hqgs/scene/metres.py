@@ -6,13 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from difflib import get_close_matches
-from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.text import some
 from hqgs.scene.faces import photo_name
+from hqgs.scene.named_split import names_by_any
 from hqgs.scene.scene import Scene
 from hqgs.scene.world import World
 
@@ -59,27 +59,16 @@ def named_photos(names: Sequence[str], distance: Distance) -> tuple[int | None, 
 
 
 def _named(names: Sequence[str], wanted: str) -> int:
+    known = {other.casefold(): name for other, name in names_by_any(names).items()}
     key = wanted.replace("\\", "/").casefold()
-    paths = [PurePosixPath(name.casefold()) for name in names]
-    for forms in (
-        names,
-        [str(path) for path in paths],
-        [path.name for path in paths],
-        [path.stem for path in paths],
-    ):
-        found = [k for k, form in enumerate(forms) if form == (wanted if forms is names else key)]
-        if len(found) > 1:
-            raise ValueError(
-                f"distance: {wanted!r} can be {some([names[k] for k in found])}; give one's whole name"
-            )
-        if found:
-            return found[0]
-    near = get_close_matches(key, [str(path) for path in paths], n=1, cutoff=0)
-    which = names[[str(path) for path in paths].index(near[0])] if near else "none"
-    raise ValueError(
-        f"distance: no photo with a camera is called {wanted!r}; the most similar name of the "
-        f"{len(names)} is {which}"
-    )
+    found = wanted if wanted in names else known.get(key)
+    if found is None:
+        near = get_close_matches(key, [*known], n=3, cutoff=0)
+        raise ValueError(
+            f"distance: no photo with a camera is called {wanted!r}, or several are; the most similar of the "
+            f"{len(names)} are {some([*dict.fromkeys(known[other] for other in near)])}; give a whole name"
+        )
+    return names.index(found)
 
 
 def in_metres(scene: Scene, distance: Distance) -> Scene:
