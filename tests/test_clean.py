@@ -70,7 +70,7 @@ def test_a_foreign_file_is_cleaned_in_its_own_frame(
     monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: replace(scene(), world=world))
     out, options = tmp_path / "clean.glb", ["--photos", "embedded", "--steps", "200"]
     assert main(["clean", str(tmp_path / "foreign.spz"), "--out", str(out), *options]) == 0
-    assert "left out: the antialias flag: a .glb file has no place for it" in capsys.readouterr().out
+    assert "left out: the antialias flag: a .glb file cannot store it" in capsys.readouterr().out
     found = Gaussians.load(out)
     assert found.world.ordinary
     read = Gaussians.load(tmp_path / "foreign.spz").means
@@ -103,7 +103,7 @@ def test_an_opacity_of_nothing_spoils_no_step() -> None:
 
 def test_a_scene_in_another_frame_is_refused() -> None:
     moved = foggy().like(foggy().named() | {"means": foggy().means + 100.0})
-    with pytest.raises(ValueError, match="6 of 6 renders are farther from their photo than one"):
+    with pytest.raises(ValueError, match="6 of 6 renders have a larger error than a picture of one colour"):
         clean(moved, scene(), steps=1)
 
 
@@ -122,7 +122,10 @@ def test_nothing_is_written_where_the_file_does_not_gain(
         return Cleaned(gaussians, 0, (80.0, 80.0), (80.0 + gain, 80.0 + gain))
 
     monkeypatch.setattr(cleaning, "clean", cleaned)
-    for name, words in (("new.ply", "does not pay, and"), ("new.splat", "do not improve as a .splat file")):
+    for name, words in (
+        ("new.ply", "do not improve; nothing"),
+        ("new.splat", "do not improve as a .splat file"),
+    ):
         assert main(["clean", str(tmp_path), "--out", str(tmp_path / name), "--steps", "9"]) == 1
         said = capsys.readouterr().err
         assert words in said

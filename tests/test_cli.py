@@ -445,8 +445,8 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
     assert call("judge", tmp_path, "--fit-cameras", "--out", tmp_path / "judged") == 0
     aligned = report["metrics"]["mean"]["psnr_aligned"]
     told = capsys.readouterr().out
-    assert f"{aligned:.2f} dB PSNR with each photo's brightness and tint set aside" in told
-    assert "cameras moved by" in told
+    assert f"{aligned:.2f} dB PSNR after each photo's brightness and tint are matched" in told
+    assert "refined poses move points by" in told
     numbers = json.loads((tmp_path / "judged" / "judge.json").read_text())["scene"]
     assert numbers["fitted"]["mean"]["psnr"] >= numbers["mean"]["psnr"]
     assert set(numbers["fitted"]["views"]) == set(numbers["views"])

@@ -298,7 +298,7 @@ def test_a_new_view_in_the_look_of_a_photo(tmp_path: Path, capsys: pytest.Captur
     np.testing.assert_allclose(dark, look.of(plain, K), atol=1.6 / 255)
     capsys.readouterr()
     assert main(["render", str(out), "--out", str(tmp_path / "x"), "--look", "view9"]) == 2
-    assert "no look of a photo 'view9' was learned; there are: view1.png, " in capsys.readouterr().err
+    assert "no exposure of a photo 'view9' was learned; there are: view1.png, " in capsys.readouterr().err
     assert main(["render", str(out / "scene.ply"), "--out", str(tmp_path / "x.png"), "--look", "view1"]) == 0
     wrong = ["--show", "depth", "--look", "view1"]
     assert main(["render", str(out), "--out", str(tmp_path / "x.png"), *wrong]) == 2

@@ -72,7 +72,7 @@ def test_all_views_at_the_end_and_some_before(tmp_path: Path) -> None:
 def test_a_run_with_few_views_measures_all_of_them(tmp_path: Path) -> None:
     run = train(scene_of(4, 1), config=tiny_config(30, eval_every=10), out=tmp_path)
     assert ["views" in entry for entry in run.history] == [False] * 3
-    assert "Measured on" not in (tmp_path / "report.html").read_text().split("While it trained")[1][:200]
+    assert "Measured on" not in (tmp_path / "report.html").read_text().split("During training")[1][:200]
     assert not any("held-out views were measured" in note for note in run.report["notes"])
 
 

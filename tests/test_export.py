@@ -103,8 +103,8 @@ def test_what_no_pixel_shows_is_left_out_without_a_change_of_a_bit() -> None:
     g.means[20, 2] = torch.nan
     steps = reduce_gaussians(g, ExportOptions("ply", band_tolerance=0.0))
     assert [(s.what, s.why) for s in steps] == [
-        ("1 Gaussians", "they hold NaN or Inf"),
-        ("2 Gaussians", "no pixel can show them: opacity below 1/255 or no rotation"),
+        ("1 Gaussians", "their values are NaN or Inf"),
+        ("2 Gaussians", "invisible: opacity below 1/255, or no rotation"),
     ]
     kept = torch.tensor([i for i in range(300) if i not in (3, 11, 20)])
     assert torch.equal(steps[-1].gaussians.means, g.means[kept])
@@ -223,7 +223,7 @@ def test_the_command_on_a_run_folder(
     assert table[3][:5] == [str(out), "39", "0", f"{out.stat().st_size:,}", share]
     assert table[3][5:] == [f"{after:.3f}", f"{after - before:+.3f}"]
     assert abs(after - before) < 0.1
-    assert "left out: 1 Gaussians: no pixel can show them" in text
+    assert "left out: 1 Gaussians: invisible" in text
     assert "left out: harmonics of degrees 1 to 3: at most 1 in 1,000 Gaussians needs them (0 of 39" in text
     assert "measured: renders of 4 cameras around the scene change by 0." in text
 

@@ -212,7 +212,7 @@ def test_export_writes_it_and_says_what_is_left_out(
     told = capsys.readouterr().out
     back = Gaussians.load(tmp_path / f"a.{name}")
     assert (len(back), back.sh_degree) == (300, 0 if name == "splat" else 3)
-    assert ("a .splat file holds none" in told) == (name == "splat")
+    assert ("a .splat file cannot store them" in told) == (name == "splat")
     assert f"{(tmp_path / f'a.{name}').stat().st_size:,}" in told
 
 

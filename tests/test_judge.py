@@ -79,7 +79,7 @@ def test_our_own_runs_bit_for_bit(run: Path, tmp_path: Path, capsys: pytest.Capt
     sure = f"{found[0]['mean']['psnr']:.2f} ± {found[0]['interval']['psnr']:.2f}"
     assert f"{sure} dB" in (run / "report.html").read_text()
     assert sure in told
-    assert "masked pixels of 1 do not count" in " ".join(told.split())
+    assert "masked pixels of 1 photo do not count" in " ".join(told.split())
     assert found[0]["gaussians"] == report["gaussians"]
     assert found[0]["bytes"] == report["scene_bytes"]
     for view in found[0]["views"].values():
@@ -111,7 +111,7 @@ def test_two_scenes_are_compared_photo_by_photo(
     assert judge(run, "--against", tmp_path / "one" / "judge.json", "--out", tmp_path / "same") == 0
     same = json.loads((tmp_path / "same" / "judge.json").read_text())["difference"]
     assert same["psnr"] == {"mean": 0.0, "interval": 0.0, "sure": False}
-    assert "(not sure)" in capsys.readouterr().out
+    assert "(not significant)" in capsys.readouterr().out
 
 
 def test_a_bright_photo_of_many_pixels_is_flat_to_all_digits() -> None:
@@ -137,7 +137,7 @@ def test_what_poses_cost_is_set_aside(
 ) -> None:
     monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: with_wrong_poses())
     assert judge(run, "--fit-cameras", "--out", tmp_path) == 0
-    assert "cameras fitted" in capsys.readouterr().out
+    assert "poses refined" in capsys.readouterr().out
     one = json.loads((tmp_path / "judge.json").read_text())["scene"]
     assert one["fitted"]["mean"]["psnr"] > one["mean"]["psnr"]
     assert one["causes"]["pose"] > 0
@@ -152,7 +152,7 @@ def test_the_page_is_one_file(run: Path, tmp_path: Path) -> None:
     assert re.findall(r'(?:src|href)="(?!data:)', page) == []
     assert page.count('type="range"') == 3
     assert page.count('class="map"') == 6
-    for word in ("What the error comes from", "How it was measured", "held out", "Student"):
+    for word in ("Causes of the error", "How it was measured", "held out", "Student"):
         assert word in page
 
 
@@ -163,7 +163,7 @@ def test_the_page_is_one_file(run: Path, tmp_path: Path) -> None:
         ({"sizes": [[24, 16], [9, 9], [24, 16]]}, "the sizes of the photos differ, [24, 16] here and [9, 9]"),
         ({"pixels": "0"}, "the photos' pixels or masks (their digest) differ"),
         ({"background": [1.0, 1.0, 1.0]}, "the backgrounds differ, 0.0 here and 1.0 there"),
-        ({"version": 0}, "the rules of measuring differ, 1 here and 0 there"),
+        ({"version": 0}, "the measuring rules differ, 1 here and 0 there"),
     ],
 )
 def test_what_cannot_be_compared_is_refused_by_name(
@@ -236,12 +236,12 @@ def test_a_foreign_file_and_a_folder_with_cameras(tmp_path: Path, capsys: pytest
     single = json.loads((tmp_path / "one" / "judge.json").read_text())
     assert single["protocol"]["names"] == [one]
     assert single["scene"]["interval"]["psnr"] is None
-    words = "farther from their photo than one flat colour is: the scene file and the photos' cameras are of"
+    words = "have a larger error than a picture of one colour: the scene file and the cameras are of"
     assert words not in capsys.readouterr().out
     replace(model, means=model.means[:, [2, 0, 1]]).save(tmp_path / "turned.ply")
     assert judge(tmp_path / "turned.ply", "--photos", root, "--out", tmp_path / "turned") == 0
     assert words in capsys.readouterr().out
-    assert "than one flat colour is" in (tmp_path / "turned" / "judge.html").read_text()
+    assert "than a picture of one colour" in (tmp_path / "turned" / "judge.html").read_text()
 
 
 def picture(seed: int = 0) -> np.ndarray:

@@ -56,8 +56,10 @@ def test_a_distance_has_the_errors_of_its_ends() -> None:
     a, b = Point(np.array([0, 0, 4.0]), 0.03), Point(np.array([2.0, 0, 4]), 0.04)
     ends = 1.96 * 0.5 * 0.05
     told = told_distance(a, b, METRE)
-    assert told == f"1.000 ± {ends:.3f} m (95 %; an error of the metre itself is not in it)"
-    assert told_distance(a, b, World()).startswith(f"2.000 ± {2 * ends:.3f} units (95 %; nothing tells")
+    assert told == f"1.000 ± {ends:.3f} m (95 %; without the error of the scale itself)"
+    assert told_distance(a, b, World()).startswith(
+        f"2.000 ± {2 * ends:.3f} units (95 %; the size of a unit is unknown"
+    )
 
 
 def test_the_bar_is_as_long_as_it_says() -> None:
@@ -90,6 +92,6 @@ def test_two_clicks_on_the_page_tell_a_distance(wall: Gaussians) -> None:
         ruler.clicked(SimpleNamespace(ray_origin=(0.0, 0.0, 0.0), ray_direction=(0.0, 0.0, 1.0)))
         assert ruler.told.content == "Click the second point."
         ruler.clicked(SimpleNamespace(ray_origin=(0.0, 0.0, 0.0), ray_direction=(0.0, 0.0, -1.0)))
-        assert ruler.told.content.startswith("Nothing is there")
+        assert ruler.told.content.startswith("No surface there")
     finally:
         viewer.close()

@@ -147,7 +147,7 @@ def test_mask_leaves_pixels_out_of_psnr_and_copies_the_photo_elsewhere() -> None
 def test_mask_that_leaves_no_pixel_gives_no_value() -> None:
     photo = photo_of(20, 20)
     got = evaluate_view(noisy(photo, 0.1), photo, np.zeros((20, 20), bool))
-    reasons: dict[str, str] = dict.fromkeys(METRICS, "the mask leaves no pixel")
+    reasons: dict[str, str] = dict.fromkeys(METRICS, "the mask hides every pixel")
     assert got == ViewMetrics(None, None, None, None, None, None, reasons)
 
 
@@ -177,7 +177,7 @@ def test_missing_values_have_a_reason() -> None:
         "haarpsi": "the view is shorter than 16 pixels on a side",
         "lpips": MISSING,
         "lpips_vgg": MISSING,
-        "psnr_aligned": "render and photo differ in brightness alone",
+        "psnr_aligned": "render and photo differ only in brightness",
     }
 
 
@@ -219,7 +219,7 @@ def test_mean_is_over_views_and_none_where_a_view_has_no_value() -> None:
     assert (mean.psnr, mean.ssim) == (25.0, pytest.approx(0.6))
     assert (mean.haarpsi, mean.lpips, mean.lpips_vgg) == (None, None, None)
     assert mean.reasons == {"haarpsi": "1 of 2 views: small", "lpips": "why", "lpips_vgg": "why"}
-    assert mean_metrics([]).reasons == dict.fromkeys(METRICS, "there is no held-out view")
+    assert mean_metrics([]).reasons == dict.fromkeys(METRICS, "there is no held-out photo")
 
 
 @pytest.mark.parametrize(

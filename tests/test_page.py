@@ -41,7 +41,7 @@ def test_a_run_has_its_page(run: hqgs.Run) -> None:
     assert text.count("data:image/jpeg;base64,") == 2 * len(run.views) + 3
     assert "Trust: on 1 held-out photo " in text
     assert '"max_gaussians": ' in text.replace("&#34;", '"')
-    assert "does not look at them" in text  # 3dgs diagnoses nothing
+    assert "does not measure them" in text  # 3dgs diagnoses nothing
 
 
 def test_nothing_is_loaded_from_elsewhere(run: hqgs.Run) -> None:
@@ -75,11 +75,11 @@ def test_a_page_without_scene_views_or_history(run: hqgs.Run) -> None:
     text = page_text(page_of(run, report=report, gaussians=None, views=[]))
     assert "<canvas" not in text
     assert text.count("not measured while it trained") == 4
-    assert told_verdict(report) == "Quality: not measured. No photo was held out: look at the scene."
+    assert told_verdict(report) == "Quality: not measured. No photo was held out: look at the renders."
     mean = {**run.report["metrics"]["mean"], "psnr": None}
-    reasons = {"psnr": "1 of 3 views: the mask leaves no pixel"}
+    reasons = {"psnr": "1 of 3 views: the mask hides every pixel"}
     report["metrics"] = {**run.report["metrics"], "mean": mean, "reasons": reasons}
-    assert told_verdict(report) == "Quality: not measured. PSNR: 1 of 3 views: the mask leaves no pixel."
+    assert told_verdict(report) == "Quality: not measured. PSNR: 1 of 3 views: the mask hides every pixel."
 
 
 def test_the_diagnosis_is_told(run: hqgs.Run) -> None:
@@ -88,7 +88,7 @@ def test_the_diagnosis_is_told(run: hqgs.Run) -> None:
     text = page_text(page_of(run, diagnosis=diagnosis))
     for part in diagnosis.parts:
         assert part.reason in text
-    assert "Each of the 5 photos" in text
+    assert "Each of the 5 measured photos" in text
 
 
 def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
@@ -120,8 +120,8 @@ def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
         for cell in ("a&lt;b&gt;.png", "4.0 px", "sharp", "+0.33", "+0.67", "+0.67", "-1.33")
     )
     assert cells + "<td></td></tr>" in text
-    assert "<th>B</th><th>slope of its curve</th></tr>" in text
-    assert "<td>up to 10% off the mean</td></tr>" in text
+    assert "<th>B</th><th>response curve</th></tr>" in text
+    assert "<td>slope up to 10% off the mean</td></tr>" in text
     assert "<td>c.png</td><td>still</td><td>1.5 px, sharp at 2 of the median depth</td><td>+0.00</td>" in text
     assert text.count("data:image/jpeg;base64,") == 2 * len(run.views)
 

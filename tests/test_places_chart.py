@@ -36,7 +36,7 @@ def test_each_camera_is_drawn_and_loose_ones_are_marked() -> None:
     assert chart is not None
     assert len(re.findall(r"<g stroke", chart)) == 24
     assert len(re.findall(r'<g stroke="#d0672a"', chart)) == 1
-    assert "07.jpg: sure to 2.50 px" in chart
+    assert "07.jpg: exact to 2.50 px" in chart
 
 
 def test_names_are_escaped_in_the_picture() -> None:

@@ -36,10 +36,12 @@ class ExportScene:
     """The file to write."""
     format: Annotated[
         str | None,
-        tyro.conf.arg(metavar="FORMAT", help_behavior_hint="", help=f"{', '.join(WRITTEN)} (as FILE ends)."),
+        tyro.conf.arg(
+            metavar="FORMAT", help_behavior_hint="", help=f"{', '.join(WRITTEN)} (by the suffix of FILE)."
+        ),
     ] = None
     sh_degree: Annotated[int, tyro.conf.arg(metavar="D")] = DEFAULTS.sh_degree
-    """Highest degree of the spherical harmonics (as the scene needs)."""
+    """Highest degree of the spherical harmonics; lower if the scene does not need it."""
     sh_bits: Annotated[tuple[int, int], values("B B", "two whole numbers", int, int)] = DEFAULTS.sh_bits
     """SPZ: bits of the harmonics of degree 1, and of degrees 2 and 3."""
     spz_version: Annotated[int, tyro.conf.arg(metavar="V")] = DEFAULTS.spz_version

@@ -14,7 +14,7 @@ from hqgs.scene.constants import ENOUGH_SHOW
 
 LABELS = {
     "psnr": "PSNR (dB)",
-    "psnr_aligned": "colours aligned (dB)",
+    "psnr_aligned": "colour-aligned PSNR (dB)",
     "ssim": "SSIM",
     "haarpsi": "HaarPSI",
     "lpips": "LPIPS",
@@ -22,16 +22,13 @@ LABELS = {
 }
 FORMS = dict.fromkeys(LABELS, ".4f") | {"psnr": ".2f", "psnr_aligned": ".2f"}
 CAUSES = {
-    "color": ("colour", "what one factor for each channel of each photo sets right"),
-    "pose": ("pose", "what fitting each camera sets right; without --fit-cameras it counts as detail"),
-    "edge": (
-        "edge of the capture",
-        f"pixels of Gaussians that under {ENOUGH_SHOW} training photos have in view",
-    ),
-    "fog": ("fog", f"pixels with more than {FOG:.0%} of their colour from far before the surface"),
-    "noise": ("noise of the photos", "in no scene, where it can be told from texture"),
-    "detail": ("missing detail", f"what is finer than some {2 * FINE:.0f} px"),
-    "broad": ("shape and shading", "the rest: broad errors"),
+    "color": ("colour", "goes away if each channel of each photo is scaled by one factor"),
+    "pose": ("pose", "goes away if each pose is refined; without --fit-cameras it counts as detail"),
+    "edge": ("edge of the capture", f"pixels of Gaussians that fewer than {ENOUGH_SHOW} training photos see"),
+    "fog": ("floaters", f"pixels with more than {FOG:.0%} of their colour from far in front of the surface"),
+    "noise": ("noise of the photos", "which no scene can show, as far as it differs from texture"),
+    "detail": ("missing detail", f"errors finer than about {2 * FINE:.0f} px"),
+    "broad": ("shape and shading", "all other errors, which are coarser"),
 }
 
 
@@ -41,18 +38,22 @@ def told(found: dict[str, Any]) -> str:
     count, which = found["protocol"]["photos"], found["protocol"]["which"]
     title = f"{one['name']} on {count} photo{'s' * (count > 1)}: {which}"
     if masked := found["protocol"]["masked"]:
-        title += f"; masked pixels of {masked} do not count"
+        title += f"; masked pixels of {masked} photo{'s' * (masked > 1)} do not count"
     shown = [name for name in LABELS if one["mean"][name] is not None]
     lines = [markdown_table(title, ["", *(LABELS[name] for name in shown)], table_rows(found, shown)), ""]
     lines += [interval_words(one)] if count > 1 else []
     if (shown_psnr := one["mean"].get("psnr_shown")) is not None:
-        lines.append(f"in the look of each photo's camera; as the scene is shown {shown_psnr:.2f} dB PSNR")
+        lines.append(
+            f"rendered with each camera's vignetting and response; without them PSNR {shown_psnr:.2f} dB"
+        )
     lines += [*not_measured(one), *wrong_frame(one)]
     lines.append(scene_words(one) + ("" if against is None else f"; against {scene_words(against)}"))
-    lines += [f"the error comes from: {cause_words(one['causes'])}", *worst(one)]
+    lines += [f"causes of the error: {cause_words(one['causes'])}", *worst(one)]
     if "fitted" in one:
         moved = sorted(view["moved_px"] for view in one["fitted"]["views"].values())
-        lines.append(f"cameras moved by {moved[len(moved) // 2]:.2f} px (median), at most {moved[-1]:.2f} px")
+        lines.append(
+            f"refined poses move points by {moved[len(moved) // 2]:.2f} px (median; at most {moved[-1]:.2f})"
+        )
     return "\n".join([*lines, f"quality: {quality(found)}"])
 
 
@@ -67,9 +68,9 @@ def quality(found: dict[str, Any]) -> str:
 def table_rows(found: dict[str, Any], shown: Sequence[str]) -> list[list[str]]:
     """A line for the scene, for fitted cameras, for the other scene and for their difference."""
     one, against = found["scene"], found.get("against")
-    rows = [["as they are", *_cells(one, shown)]]
+    rows = [["poses as given", *_cells(one, shown)]]
     if "fitted" in one:
-        rows.append(["cameras fitted", *_cells(one["fitted"], shown)])
+        rows.append(["poses refined", *_cells(one["fitted"], shown)])
     if against is not None:
         rows += [
             [f"against {short_names(one, against)[1]}", *_cells(against, shown)],
@@ -86,9 +87,7 @@ def short_names(one: dict[str, Any], other: dict[str, Any]) -> tuple[str, str]:
 
 def interval_words(one: dict[str, Any]) -> str:
     """What ± is."""
-    return (
-        f"± half the {one['confidence']:.0%} interval of the mean over such photos; of a difference, by photo"
-    )
+    return f"±: {one['confidence']:.0%} confidence interval of the mean; differences are taken photo by photo"
 
 
 def wrong_frame(one: dict[str, Any]) -> list[str]:
@@ -102,8 +101,8 @@ def apart(worse: int, photos: int) -> str | None:
     if 2 * worse <= photos:
         return None
     return (
-        f"{worse} of {photos} renders are farther from their photo than one flat colour is: the scene "
-        "file and the photos' cameras are of different captures, or in different frames"
+        f"{worse} of {photos} renders have a larger error than a picture of one colour: the scene file and "
+        "the cameras are of different captures, or in different frames"
     )
 
 
@@ -130,7 +129,9 @@ def scene_words(one: dict[str, Any]) -> str:
     words = f"{one['gaussians']:,} Gaussians, {one['bytes'] / 1e6:.3g} MB"
     if "render_seconds" in one:
         threads = one["threads"]
-        words += f", {1000 * one['render_seconds']:.0f} ms a render on {threads} thread{'s' * (threads > 1)}"
+        words += (
+            f", {1000 * one['render_seconds']:.0f} ms per render on {threads} thread{'s' * (threads > 1)}"
+        )
     return words
 
 
@@ -160,6 +161,6 @@ def _cells(of: dict[str, Any], shown: Sequence[str]) -> list[str]:
 def word_for(metric: str, apart: dict[str, Any]) -> str:
     """Whether a difference is one: better, worse, or within its interval."""
     if not apart["sure"]:
-        return "not sure"
+        return "not significant"
     less_is_better = metric in ("lpips", "lpips_vgg")
     return "better" if (apart["mean"] > 0) != less_is_better else "worse"

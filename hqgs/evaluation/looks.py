@@ -57,10 +57,10 @@ def look_of(folder: Path, name: str) -> Look:
     looks = _looks(read_report(folder / REPORT).get("learned", []))
     if not any(one.changes for one in looks.values()):
         raise ValueError(
-            f"{folder}: no gains, vignetting or response of photos were learned: the photos look alike"
+            f"{folder}: no exposure, vignetting or response was learned, so all photos are rendered alike"
         )
     stems = {Path(photo).stem: look for photo, look in looks.items()}
     if (found := looks.get(name, stems.get(name))) is None:
         some = ", ".join([*looks][:3])
-        raise ValueError(f"no look of a photo {name!r} was learned; there are: {some}, ...")
+        raise ValueError(f"no exposure of a photo {name!r} was learned; there are: {some}, ...")
     return found

@@ -163,7 +163,7 @@ def evaluate_view(
     """All metrics of one view; the module's docstring says how images and masks are read."""
     if mask is not None and mask.dtype == np.bool_ and not mask.any():
         _pair(render, photo, mask)
-        return _without_values("the mask leaves no pixel")
+        return _without_values("the mask hides every pixel")
     values = {
         "psnr": psnr(render, photo, mask),
         "ssim": ssim(render, photo, mask),
@@ -178,7 +178,7 @@ def evaluate_view(
         "haarpsi": too_small.format(HAARPSI_MIN_SIZE),
         "lpips": lpips_missing("alex") or too_small.format(LPIPS_MIN_SIZE),
         "lpips_vgg": lpips_missing("vgg") or too_small.format(LPIPS_MIN_SIZE),
-        "psnr_aligned": "render and photo differ in brightness alone",
+        "psnr_aligned": "render and photo differ only in brightness",
     }
     return ViewMetrics(**values, reasons={m: reasons[m] for m, value in values.items() if value is None})
 
@@ -189,7 +189,7 @@ def mean_metrics(views: list[ViewMetrics]) -> ViewMetrics:
     A mean is None if one view lacks the value: a mean over fewer views could not be compared with others.
     """
     if not views:
-        return _without_values("there is no held-out view")
+        return _without_values("there is no held-out photo")
     means: dict[str, float | None] = {}
     reasons: dict[str, str] = {}
     for metric in METRICS:

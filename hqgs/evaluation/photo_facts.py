@@ -30,9 +30,9 @@ def photo_words(record: PhotoRecord) -> dict[str, str]:
     blur, quality, factor = record["blur"], record["jpeg_quality"], record["enlarged"]
     return {
         "size": f"{record['width']} x {record['height']}",
-        "blur": "not told" if blur is None else f"{blur}, {record['blur_px']:.2f} px",
-        "noise": "not told" if record["noise"] is None else f"{record['noise']:.1f} levels",
-        "JPEG quality": "no JPEG seen" if quality is None else f"{quality}",
+        "blur": "unknown" if blur is None else f"{blur}, {record['blur_px']:.2f} px",
+        "noise": "unknown" if record["noise"] is None else f"{record['noise']:.1f} levels",
+        "JPEG quality": "not visible" if quality is None else f"{quality}",
         "enlarged": "no" if factor == 1 else f"x{factor}",
     }
 
@@ -47,9 +47,9 @@ def learned_words(record: LearnedRecord) -> dict[str, str]:
         focus += f", sharp at {record['focus']:.2g} of the median depth"
     words = {"shake": shake, "out of focus": focus, "exposure, stops": f"{stops.mean():+.2f}", **rgb}
     if (fall := sum(record.get("vignetting", [0.0]))) != 0:
-        words["corners"] = f"{np.expm1(-fall):+.0%} of the light"
+        words["vignetting"] = f"{np.expm1(-fall):+.0%} light in the corners"
     if (bends := np.abs(record.get("response", [[0.0]]))).any():
-        words["slope of its curve"] = f"up to {bends.sum(0).max():.0%} off the mean"
+        words["response curve"] = f"slope up to {bends.sum(0).max():.0%} off the mean"
     return words
 
 

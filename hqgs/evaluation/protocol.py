@@ -21,21 +21,21 @@ COMPARED = {  # what must be equal, in the order in which it is told
     "sizes": "the sizes of the photos",
     "pixels": "the photos' pixels or masks (their digest)",
     "background": "the backgrounds",
-    "version": "the rules of measuring",
+    "version": "the measuring rules",
 }
 VERSION = 1  # of RULES: raised where numbers come to differ; a judge.json without one is of the first
 RULES = {
     "color": "sRGB values as the photos store them, white is 1; renders clamped to 0..1, not rounded",
     "cameras": "pinholes; distorted photos undistorted on load",
-    "low_pass": f"{EPS2D:g} px^2 on projected covariances; compensated where the scene file says so",
-    "psnr": "-10 log10 of the mean squared error of the pixels and channels that count; mean over photos",
+    "low_pass": f"{EPS2D:g} px^2 on projected covariances; compensated if the scene file says so",
+    "psnr": "-10 log10 of the mean squared error over all unmasked pixels and channels; mean over photos",
     "psnr_aligned": "after one factor for each photo and channel, by least squares",
     "ssim": "11 x 11 Gaussian window of sigma 1.5, zero padding, mean over channels; mean over photos",
     "haarpsi": "Reisenhofer et al. 2018, in colour; mean over photos",
     "lpips": "v0.1; mean over photos",
     "masks": "masked pixels do not count for PSNR, and are the photo's own for the other metrics",
-    "interval": f"Student's, {CONFIDENCE:.0%}, over photos, no narrower than other scenes let expect of as "
-    "many; of a difference, paired by photo",
+    "interval": f"Student's t, {CONFIDENCE:.0%}, over photos, at least as wide as on other scenes with as "
+    "many photos; of a difference, paired by photo",
 }
 
 
@@ -62,12 +62,10 @@ def protocol_of(
 def told_which(scene: Scene, which: str) -> str:
     """Which photos were measured on, in words."""
     every = (scene.origin or {}).get("test_every", 0)
-    rule = f"one of {every} by name, unless the scene has a split" if every else "as the scene has them"
-    return {
-        HELD_OUT: f"held out ({rule})",
-        TRAINED: "those that are trained on",
-        ALL: "all, those that are trained on among them",
-    }.get(which, "those that were named")
+    rule = f"every {every}th by name, unless the scene has a split" if every else "as the scene has them"
+    return {HELD_OUT: f"held out ({rule})", TRAINED: "training photos", ALL: "all, training photos too"}.get(
+        which, "as named"
+    )
 
 
 def chosen_views(scene: Scene, which: str) -> list[View]:

@@ -99,7 +99,7 @@ def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
     amplified = f"absolute difference x{AMPLIFICATION}"
     if view.mask is not None:
         panels[2][~view.mask] = MASKED
-        amplified += ", grey: masked out"
+        amplified += ", grey: masked"
     numbers = [] if metrics.psnr is None else [f"{metrics.psnr:.2f} dB"]
     numbers += [] if metrics.ssim is None else [f"SSIM {metrics.ssim:.3f}"]
     captions = [f"photo  {printable(Path(view.name).stem)}", "  ".join(["render", *numbers]), amplified]

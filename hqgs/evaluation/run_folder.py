@@ -98,11 +98,11 @@ class RunFolder:
             asked = LoadOptions(**self.loaded)
         except TypeError as error:
             path = self.folder / CONFIG
-            raise ValueError(f"{path} does not tell which scene was trained: {error}") from error
+            raise ValueError(f"{path} does not say which scene was trained: {error}") from error
         try:
             scene = load_as(asked, self.folder, on_stage=on_stage)
         except FileNotFoundError as error:
-            raise FileNotFoundError(f"the photos of the run {self.folder} are not known: {error}") from error
+            raise FileNotFoundError(f"the photos of the run {self.folder} are unknown: {error}") from error
         without = self.without
         scene = replace(scene, train=[view for view in scene.train if view.name not in without])
         check_same(scene, self, split=True)
@@ -157,17 +157,17 @@ def check_same(scene: Scene, run: RunFolder, split: bool) -> None:
     told = "; ".join(f"{what}: {some(names)}" for what, names in changes.items() if names)
     if split and before != now:
         raise ValueError(
-            f"{scene.name}: these are not the photos that the run {run.folder} was trained and measured with "
-            f"({told or 'others are held out'}); put them back as they were, or train anew"
+            f"{scene.name}: the photos differ from those of the run {run.folder} "
+            f"({told or 'others are held out'}): restore them, or train again"
         )
     px = moved_px(scene, known)
     if px is None or px > SAME_POSE:
-        by = "none is one of the run's" if px is None else f"photos are off by {px:.1f} px"
-        told = told or "none is gone or new, so some are not as they were"
+        by = "no photo is in both" if px is None else f"points move by {px:.1f} px in the photos"
+        told = told or "none is gone or new, but some have other pixels"
         raise ValueError(
-            f"{scene.name}: its cameras are not those of the run {run.folder}: {by}. The photos have changed "
-            f"since ({told}), and cameras found anew are in another frame; put them back as they were, or "
-            "train anew"
+            f"{scene.name}: its cameras differ from those of the run {run.folder}: {by}. The photos have "
+            f"changed since ({told}), and newly found cameras are in another frame: restore the photos, or "
+            "train again"
         )
 
 

@@ -13,12 +13,12 @@ _LEVELS = (
     (
         20.0,
         "poor",
-        "below 20 dB renders are far from held-out photos: wrong poses, too few photos, or too short a run",
+        "below 20 dB: renders are far from the photos. Wrong poses, too few photos or a short run?",
     ),
-    (25.0, "fair", "20 to 25 dB: the scene is recognisable and soft; a longer run or more photos help"),
-    (30.0, "good", "25 to 30 dB: details are there"),
+    (25.0, "fair", "20 to 25 dB: the scene is recognisable but soft; train longer or take more photos"),
+    (30.0, "good", "25 to 30 dB: details are visible"),
 )
-_BEST = ("very good", "above 30 dB: hard to tell from the photo at a glance")
+_BEST = ("very good", "above 30 dB: at a glance it looks like the photo")
 
 
 def verdict(psnr: float | None, measured: Mapping[str, Any] | None = None) -> tuple[str, str]:
@@ -29,7 +29,7 @@ def verdict(psnr: float | None, measured: Mapping[str, Any] | None = None) -> tu
     if psnr is None and measured is not None and measured["views"]:
         return "not measured", f"PSNR: {measured['reasons']['psnr']}"
     if psnr is None:
-        return "not measured", "no photo was held out: look at the scene"
+        return "not measured", "no photo was held out: look at the renders"
     return next(((word, why) for limit, word, why in _LEVELS if psnr < limit), _BEST)
 
 
@@ -54,8 +54,8 @@ def overdone(history: Sequence[HistoryEntry]) -> str | None:
     if fall <= SCATTER or ssim <= moments[-1][1]:
         return None
     return (
-        f"more iterations did not pay: the held-out photos were best after iteration {iteration:,}, "
-        f"{fall:.1f} dB above the end"
+        f"training was too long: held-out photos were best after iteration {iteration:,}, {fall:.1f} dB "
+        "better than at the end"
     )
 
 
@@ -68,10 +68,10 @@ def judged_by(report: Mapping[str, Any]) -> tuple[float | None, str]:
     mean = report["metrics"]["mean"]
     exposed = len({tuple(record["gains"]) for record in report.get("learned", [])}) > 1
     if exposed and mean.get("psnr_aligned") is not None:
-        return mean["psnr_aligned"], "PSNR with each photo's brightness and tint set aside"
+        return mean["psnr_aligned"], "PSNR after each photo's brightness and tint are matched"
     shown = report["metrics"].get("psnr_shown", mean.get("psnr_shown"))
     if shown is not None:
-        return mean["psnr"], f"PSNR in the look of the photos' cameras, {shown:.1f} dB as the scene is shown"
+        return mean["psnr"], f"PSNR with the cameras' vignetting and response, {shown:.1f} dB without"
     return mean["psnr"], "PSNR"
 
 

@@ -66,10 +66,10 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
         saved = None if before is None or after is None else before - after
         left_out.append(LeftOut(step.what, step.why, step.evidence, bytes=saved))
     if gaussians.antialiased and not FORMATS[options.format].antialiased:
-        why = f"a .{options.format} file has no place for it: what is finer than a pixel is shown too opaque"
+        why = f"a .{options.format} file cannot store it; detail finer than a pixel is shown too opaque"
         left_out.append(LeftOut("the antialias flag", why))
     if gaussians.errors is not None and not FORMATS[options.format].errors:
-        left_out.append(LeftOut("trust of the Gaussians", f"a .{options.format} file has no place for it"))
+        left_out.append(LeftOut("trust of the Gaussians", f"a .{options.format} file cannot store it"))
     return Export(path, written, len(reduced), reduced.sh_degree, left_out, clipped)
 
 
@@ -91,8 +91,8 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Reduc
     finite = g.finite()
     visible = (g.activated_opacities() >= ALPHA_MIN) & (g.quats.square().sum(dim=1) >= QUAT_NORM2_MIN)
     for keep, others, why in (
-        (finite, n, "they hold NaN or Inf"),
-        (finite & visible, int(finite.sum()), "no pixel can show them: opacity below 1/255 or no rotation"),
+        (finite, n, "their values are NaN or Inf"),
+        (finite & visible, int(finite.sum()), "invisible: opacity below 1/255, or no rotation"),
     ):
         if (gone := others - int(keep.sum())) > 0:
             steps.append(Reduction(gaussians.detached().rows(keep), f"{gone:,} Gaussians", why))
@@ -105,9 +105,9 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Reduc
         cut = int((degrees > degree).sum())
         asked = degree == options.sh_degree
         why = (
-            f"a .{options.format} file holds none"
+            f"a .{options.format} file cannot store them"
             if not FORMATS[options.format].harmonics
-            else "--sh-degree asks for it"
+            else "by --sh-degree"
             if asked
             else f"at most 1 in {1 / BAND_SHARE:,.0f} Gaussians needs them"
         )
@@ -120,7 +120,7 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Reduc
     if options.format == "spz":  # zeros save nothing in the others, and in SOG little: 4 % of a file for 6 dB
         fewer = _without_bands(g, degrees)
         if changed := int((fewer.shN != g.shN).flatten(1).any(dim=1).sum()):
-            why = f"they change a colour by at most {options.band_tolerance:g}"
+            why = f"they change colours by at most {options.band_tolerance:g}"
             steps.append(Reduction(fewer, f"the highest harmonics of {changed:,} Gaussians", why))
     return steps
 

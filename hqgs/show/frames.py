@@ -115,7 +115,7 @@ def check_frames(cameras: Sequence[Camera], out: Path, fps: float, show: str) ->
         sizes = sorted({(camera.width, camera.height) for camera in cameras})
         if len(sizes) > 1:
             each = " and ".join(f"{w} x {h}" for w, h in sizes[:2])
-            raise ValueError(f"{out}: a film has frames of one size, these cameras have {each} px")
+            raise ValueError(f"{out}: all frames of a film have one size, these cameras have {each} px")
         if suffix == ".mp4" and min(sizes[0]) < 2:
             raise ValueError(f"a film has sides of at least 2 px, these are {sizes[0][0]} x {sizes[0][1]}")
         if suffix == ".mp4":
@@ -146,7 +146,7 @@ def frames(
         yield from (prepared.color(camera, background, look) for camera in cameras)
     elif show == "trust":
         if trust is None:
-            raise ValueError("show is 'trust', which needs what the photos say of the Gaussians")
+            raise ValueError("show is 'trust', which needs the errors of the Gaussians, measured by photos")
         yield from (trust_picture(trust.bound(camera)) for camera in cameras)
     elif show == "alpha":
         yield from (grey(prepared.depth(camera)[1]) for camera in cameras)

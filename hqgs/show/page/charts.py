@@ -100,6 +100,6 @@ def places_chart(scene: Scene) -> Markup | None:
         length = float(np.linalg.norm(ahead))
         ahead = ahead / length * 9 if length > 1e-6 else np.zeros(2)
         px = sure.get(photo_name(view.name, view.face))
-        words = view.name if px is None else f"{view.name}: sure to {px:.2f} px"
+        words = view.name if px is None else f"{view.name}: exact to {px:.2f} px"
         shown.append((*at(place), *at(place + ahead / scale), px is not None and px > most, words))
     return filled("places.svg.j2", points=[*map(at, points)], cameras=shown)

@@ -73,7 +73,7 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
         other=names[1],
         pairs=[_pair(judged, number, one["views"], against) for number in chosen],
         pairs_left=len(order) - len(chosen),
-        photo_heads=["photo", *(LABELS[name] for name in shown), "fine contrast", "the error comes from"],
+        photo_heads=["photo", *(LABELS[name] for name in shown), "fine contrast", "causes of the error"],
         photos=[_row(name, one["views"][name], shown) for name in order],
         protocol=_protocol(protocol),
     )

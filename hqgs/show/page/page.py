@@ -159,9 +159,9 @@ def trust_part(folder: Path, gaussians: Gaussians, iterations: int) -> TrustPart
     trust = learn_trust(gaussians, load_cameras(folder), photos, held_out=photos)
     measured = measure_trust(trust)
     if measured is None:
-        why = "No photo was held out, so no number says how far renders of other places can be believed."
+        why = "No photo was held out, so the errors of new views are unknown."
         return TrustPart(why)
-    by = "Each photo is judged by a calibration on the others" if measured.photos > 1 else "Not calibrated"
+    by = "The bound of each photo is calibrated on the others" if measured.photos > 1 else "Not calibrated"
     one = max(trust.held, key=lambda held: held.flat(held.error).mean())
     render = to_uint8(gaussians.render(one.camera).detach().numpy())
     maps = {"render": render, "trust": trust_picture(trust.bound(one.camera))}
@@ -191,7 +191,7 @@ def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
         ("iterations", f"{report['iterations']:,}"),
     ]
     if (shown := report["metrics"].get("psnr_shown")) is not None:
-        facts.insert(1, ("PSNR as shown, not in the cameras' look", f"{shown:.2f} dB"))
+        facts.insert(1, ("PSNR without the cameras' vignetting and response", f"{shown:.2f} dB"))
     if report["peak_rss_mb"] is not None:
         facts.append(("memory", f"{report['peak_rss_mb']:,.0f} MB"))
     if report["scene_bytes"] is not None:
@@ -209,7 +209,7 @@ def _scene(scene: Scene, gaussians: Gaussians, background: Json) -> dict[str, An
         f"{packed.gaussians:,} Gaussians, harmonics of degree {packed.sh_degree}, {packed.bytes / 1e6:.1f} MB"
     )
     if packed.left_out:
-        note += f"; without {packed.left_out:,} that show least"
+        note += f"; the {packed.left_out:,} least visible ones are left out"
     first = cameras[0]
     return {
         "data": packed.data,

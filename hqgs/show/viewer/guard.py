@@ -25,7 +25,7 @@ HOST, PORT = "127.0.0.1", 8080
 MAX_MESSAGE = 1 << 20  # bytes; what a page of ours sends takes hundreds
 # Words for those whose browser is not on this machine: a container, a remote editor, a notebook in a cloud.
 ELSEWHERE = (
-    "From another machine, forward the port to it under the same number: "
+    "To see it on another machine, forward the port under the same number: "
     "`ssh -L {port}:localhost:{port} HOST`; VS Code: the tab Ports; Docker: run with `--network host`, then "
     "as for HOST; JupyterHub and Colab: no page of another origin may speak to this one: send report.html "
     "instead, which needs no server."

@@ -57,9 +57,9 @@ def told_distance(a: Point, b: Point, world: World) -> str:
     length = world.unit * float(np.linalg.norm(a.at - b.at))
     error = 1.96 * world.unit * math.hypot(a.error, b.error)
     digits = max(0, 1 - math.floor(math.log10(error))) if error > 0 else 3
-    unit, scale = "units", "; nothing tells how long a unit is"
+    unit, scale = "units", "; the size of a unit is unknown"
     if world.metres:
-        unit, scale = "m", "; an error of the metre itself is not in it"
+        unit, scale = "m", "; without the error of the scale itself"
     return f"{length:.{digits}f} ± {error:.{digits}f} {unit} (95 %{scale})"
 
 
@@ -121,7 +121,7 @@ class Ruler:
         scene = self._scene()
         point = None if scene is None else picked(scene, event.ray_origin, event.ray_direction)
         if point is None:
-            self.told.content = "Nothing is there: click on something solid."
+            self.told.content = "No surface there: click on an object."
             return
         if len(self._points) == 2:
             self._clear()

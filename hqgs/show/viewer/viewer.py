@@ -331,7 +331,7 @@ class Viewer:
         if not self._keys:
             self._tell("Add a view first.")
         elif self._folder is None:
-            self._tell("This scene has no folder to save it in.")
+            self._tell("This scene has no folder to save the path in.")
         else:
             path = self._folder / PATH_FILE
             shown = self._gaussians
