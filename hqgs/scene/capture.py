@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -129,22 +131,44 @@ def inside(root: Path, name: str, what: str) -> Path:
     return path
 
 
-def found_inside(root: Path, name: str, what: str, files: Named) -> Path | None:
-    """The file inside `root` that a written name means, as `inside` has it, else by name (`Named.find`).
+def files_named(
+    root: Path, names: Iterable[str], what: str, files: Named, others: Iterable[str] = ()
+) -> dict[str, Path]:
+    """The files inside `root` that written names mean, by name; those that are gone are not among them.
 
-    None where there is none. ValueError as `inside` raises it, where no file in `root` has such a name.
+    That is the file where the name says, else the only one there up to the suffix, else what other machines
+    call so (`Named.find`), if it is not that of another name, of `names` or `others`.
+    ValueError where a name leaves `root`, and no file there has such a name.
     """
-    written = name.replace("\\", "/")
-    for option in (name, written):
-        try:
-            path = inside(root, option, what)
-        except ValueError:
-            continue
-        if os.path.lexists(path) and not path.is_dir():
-            return path
-    if (found := files.find(name)) is None:
-        inside(root, written, what)
+    names = [*names]
+    exact = {name: path for name in (*names, *others) if (path := _there(root, name)) is not None}
+    taken = set(exact.values())
+    found = {name: exact[name] for name in names if name in exact}
+    for name in names:
+        if name not in found and (path := files.up_to_suffix(name)) is not None and path not in taken:
+            found[name] = path
+    taken |= {*found.values()}
+    for name in names:
+        path = found.get(name) or files.find(name, taken.__contains__)
+        if path is None:
+            try:
+                inside(root, name.replace("\\", "/"), what)
+            except ValueError:
+                if (path := files.find(name)) is None:  # else the same photo, written otherwise
+                    raise
+        if path is not None:
+            found[name] = path
     return found
+
+
+def _there(root: Path, name: str) -> Path | None:
+    """The file where a written name says that it is; None: there is none."""
+    for option in dict.fromkeys((name, name.replace("\\", "/"))):
+        with suppress(ValueError):
+            path = inside(root, option, "")
+            if os.path.lexists(path) and not path.is_dir():
+                return path
+    return None
 
 
 def photo_folder(root: Path, downscale: float) -> tuple[Path, float, list[str]] | None:

@@ -11,6 +11,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import cached_property
 from itertools import chain
 from pathlib import Path, PurePosixPath
@@ -18,7 +19,7 @@ from unicodedata import normalize
 from urllib.parse import unquote
 
 from hqgs.base.files import CHECKPOINT, CONFIG, LOCK, PLY, RUN_FILES, RUN_FOLDERS
-from hqgs.base.text import some
+from hqgs.base.text import as_text, some
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.names import FILM_SUFFIXES, KEPT
 
@@ -145,8 +146,23 @@ class Named:
         files: dict[str, list[tuple[Key, Path]]] = {}
         for path in below(self._root, self._suffixes):
             key = _parts(path.relative_to(self._root).as_posix())
-            files.setdefault(_bare(key[-1], self._suffixes), []).append((key, path))
+            files.setdefault(without_suffix(key[-1], self._suffixes), []).append((key, path))
         return files
+
+    @cached_property
+    def _stems(self) -> dict[str, list[Path]]:
+        stems: dict[str, list[Path]] = {}
+        for path in below(self._root, self._suffixes):
+            name = path.relative_to(self._root).as_posix()
+            for called in {name, as_text(name), of_windows(name)}:
+                stems.setdefault(without_suffix(called, self._suffixes), []).append(path)
+        return stems
+
+    def up_to_suffix(self, written: str) -> Path | None:
+        """The one file there with another suffix, or with one; None: none, or several."""
+        plain = os.path.normpath(written.replace("\\", "/"))
+        alike = self._stems.get(without_suffix(plain, self._suffixes)) or self._stems.get(plain, [])
+        return alike[0] if len(alike) == 1 else None
 
     def find(self, written: str, taken: Callable[[Path], bool] = lambda _: False) -> Path | None:
         """The one file that the name can mean and that is not taken; None where there is none, or several.
@@ -161,7 +177,7 @@ class Named:
                 continue
             fitting = [
                 (_fit(key, own), own, path)
-                for stem in dict.fromkeys((_bare(key[-1], self._suffixes), key[-1]))
+                for stem in dict.fromkeys((without_suffix(key[-1], self._suffixes), key[-1]))
                 for own, path in self._files.get(stem, [])
                 if not taken(path) and not any(map(of_maps, own[: len(own) - 1 - _fit(key, own)[0]]))
             ]
@@ -198,9 +214,18 @@ def _parts(name: str) -> Key:
     return tuple(part.strip() for part in plain.split("/") if part not in ("", ".", ".."))
 
 
-def _bare(name: str, suffixes: tuple[str, ...]) -> str:
-    """The last part of a name without a suffix of those that count."""
-    return next((name[: -len(s)] for s in suffixes if name.endswith(s) and len(name) > len(s)), name)
+def without_suffix(name: str, suffixes: tuple[str, ...]) -> str:
+    """A name without a suffix of those that count."""
+    return next((name[: -len(s)] for s in suffixes if name.lower().endswith(s) and len(name) > len(s)), name)
+
+
+def of_windows(name: str) -> str:
+    """A name as text: what is no UTF-8 was written by an older Windows, or is escaped."""
+    raw = name.encode("utf-8", "surrogateescape")
+    for code in ("utf-8", "cp1252"):
+        with suppress(UnicodeDecodeError):
+            return raw.decode(code)
+    return as_text(name)
 
 
 def _fit(wanted: Key, own: Key) -> tuple[int, bool]:

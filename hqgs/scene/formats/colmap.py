@@ -13,14 +13,14 @@ from hqgs.base.text import some
 from hqgs.scene.capture import NO_POSE, Capture, Photo, keep_finite, list_photos, no_points, viewmat_from_pose
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap_binary import cameras_file_size, check_binary_model, image_names
-from hqgs.scene.formats.colmap_mended import NEEDED, POINTS, kind_of, mended, of_windows, whole_names
+from hqgs.scene.formats.colmap_mended import NEEDED, POINTS, kind_of, mended, whole_names
 from hqgs.scene.formats.colmap_photos import photos_of
 from hqgs.scene.formats.point_files import read_ply_points
 from hqgs.scene.geometry import project
 from hqgs.scene.masks import masks_of
 from hqgs.scene.named_split import held_out, listed_split, names_by_any
 from hqgs.scene.names import KEPT
-from hqgs.scene.photo_files import is_run
+from hqgs.scene.photo_files import is_run, of_windows
 from hqgs.scene.scene import Camera, TrackStatistics
 
 _POINT_FILES = (f"{POINTS}.ply", "points.ply", "input.ply")  # in place of COLMAP's own

@@ -6,11 +6,11 @@ import math
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hqgs.base.text import as_text, some
+from hqgs.base.text import some
 
 NEEDED, POINTS = ("cameras", "images"), "points3D"
 _RIGGED = ("frames", "rigs")  # from COLMAP 3.12 on, of no use without each other
@@ -80,15 +80,6 @@ def whole_names(path: Path) -> dict[int, str]:
     """The photos' names in an images.txt by their ids, as far as the line goes: with their spaces."""
     words = (line.strip().split(None, HEAD) for line in _decoded(path.read_bytes()) if _is_photo(line))
     return {int(found[0]): found[HEAD] for found in words}
-
-
-def of_windows(name: str) -> str:
-    """A name as text: what is no UTF-8 was written by an older Windows, or is escaped."""
-    raw = name.encode("utf-8", "surrogateescape")
-    for code in ("utf-8", "cp1252"):
-        with suppress(UnicodeDecodeError):
-            return raw.decode(code)
-    return as_text(name)
 
 
 def _decoded(text: bytes) -> list[str]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-from hqgs.base.text import as_text, some
-from hqgs.scene.capture import found_inside, inside, list_photos, perhaps, photo_folder
-from hqgs.scene.formats.colmap_mended import of_windows
+from hqgs.base.text import some
+from hqgs.scene.capture import files_named, inside, list_photos, perhaps, photo_folder
 from hqgs.scene.photo_files import Named, is_mask_folder, is_run, of_maps
 
 INPUT = "input"  # 3DGS's convert.py: photos as they were before they were undistorted
@@ -70,49 +68,16 @@ def _named(folder: Path, name: str) -> bool:
 
 
 def match_some(names: list[str], root: Path, folder: Path, notes: list[str]) -> dict[str, Path]:
-    """The files of the photos that have one: by name; by name up to the suffix; in `images_N` also by sorted
-    position; at last by what of the name other machines wrote otherwise (`Named`).
+    """The files of the photos that have one (`files_named`); in `images_N` by sorted position where none has.
 
     LLFF's scaled photos have names of their own (image000.png for IMG_4026.JPG) in the same order.
     """
-    present = list_photos(folder)
-    by_stem: dict[str, list[str]] = {}
-    for n in present:
-        for written in {n, as_text(n), of_windows(n)}:
-            by_stem.setdefault(stem(written), []).append(n)
-    files: dict[str, Path] = {}
-    for name in names:
-        if "\0" in name:
-            inside(folder, name, "the COLMAP model's photo")
-        exact = Path(os.path.normpath(folder / name))
-        if exact.is_relative_to(folder) and os.path.lexists(exact) and not exact.is_dir():
-            files[name] = exact
-    exactly = set(files.values())
-    for name in names:
-        similar = [n for n in by_stem.get(stem(name), []) if folder / n not in exactly]
-        if name not in files and len(similar) == 1:
-            files[name] = folder / similar[0]
-    missing = [name for name in names if name not in files]
-    if not missing:
-        return files
-    originals = root / "images"
-    originals_names = list_photos(originals) if originals.is_dir() else names
-    renamed = folder != originals and len(missing) == len(names) and len(originals_names) == len(present)
-    scaled = folder.name.startswith("images_")
-    if renamed and scaled and set(names) <= set(originals_names):
+    listed, present, originals = Named(folder), list_photos(folder), root / "images"
+    all_names = list_photos(originals) if originals.is_dir() else names
+    scaled = folder.name.startswith("images_") and set(names) <= set(all_names)
+    if scaled and len(all_names) == len(present) and not any(map(listed.up_to_suffix, names)):
         notes.append(f"{folder.name} has other file names than the cameras: matched by sorted position")
-        return {n: folder / p for n, p in zip(originals_names, present, strict=True) if n in set(names)}
-    listed, used = Named(folder), set(files.values())
-    for name in missing:
-        found = listed.find(name, used.__contains__)
-        if found is None:
-            found_inside(folder, name, "the COLMAP model's photo", listed)  # else it leaves the folder
-        else:
-            files[name] = found
+        return {n: folder / p for n, p in zip(all_names, present, strict=True) if n in set(names)}
+    files = files_named(folder, names, "the COLMAP model's photo", listed)
     notes += listed.note()
     return files
-
-
-def stem(name: str) -> str:
-    """The name without its suffix."""
-    return name.rsplit(".", 1)[0]

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from hqgs.base.files import read_json
 from hqgs.photos.files import UnreadableError, stored_size
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
-from hqgs.scene.capture import Capture, Photo, found_inside, inside, keep_finite, no_points, viewmat_from_pose
+from hqgs.scene.capture import Capture, Photo, files_named, inside, keep_finite, no_points, viewmat_from_pose
 from hqgs.scene.constants import MOST_SIDE, SMALLEST_SIDE
 from hqgs.scene.faces import AROUND, around
 from hqgs.scene.formats.point_files import read_ply_points
@@ -69,15 +68,15 @@ def read_transforms(root: Path, downscale: float) -> Capture:
     Raises ValueError, FileNotFoundError for a mask that is missing; both name the file.
     """
     notes: list[str] = []
-    files, listed = Named(root), cache(partial(_listed, root))
     present = [name for name in (TRAIN, TEST, VAL) if (root / name).is_file()]
     main = SINGLE if (root / SINGLE).is_file() and (TRAIN not in present or len(present) < 2) else TRAIN
-    meta = _read(root / main)
-    photos, called = _read_frames(root, main, meta, files, listed)
-    test_names = None
     split_file = TEST if TEST in present else VAL if VAL in present else None
+    metas, files = {name: _read(root / name) for name in (main, split_file) if name}, Named(root)
+    paths = _paths(root, metas, files)
+    photos, called = _read_frames(root, main, metas[main], paths)
+    meta, test_names = metas[main], None
     if split_file is not None:
-        test, _ = _read_frames(root, split_file, _read(root / split_file), files, listed)
+        test, _ = _read_frames(root, split_file, metas[split_file], paths)
         test_names = frozenset(p.name for p in test)
         if main == SINGLE:
             photos = [p for p in photos if p.name not in test_names]
@@ -100,7 +99,7 @@ def read_transforms(root: Path, downscale: float) -> Capture:
     ply = meta.get("ply_file_path")
     if ply not in (None, ""):
         written = _text(ply, "ply_file_path", root)
-        path = found_inside(root, written, "ply_file_path", Named(root, (".ply",)))
+        path = files_named(root, [written], "ply_file_path", Named(root, (".ply",))).get(written)
         if path is None or not path.is_file():
             notes.append(f"ply_file_path {ply!r} names no file in {root}")
         else:
@@ -138,8 +137,24 @@ def _pose(frame: dict[str, Any], where: str) -> NDArray[np.float64]:
     return np.linalg.inv(viewmat)[:3]
 
 
+def _paths(root: Path, metas: dict[str, dict[str, Any]], files: Named) -> dict[str, Path]:
+    """The photos by what files call them. None is that of another frame, read or not."""
+    others = list[str]()
+    for name in {SINGLE, TRAIN, TEST, VAL} - {*metas}:
+        with suppress(OSError, ValueError):  # of one that is not there, or is not read
+            others += _written(_read(root / name))
+    names = [name for meta in metas.values() for name in _written(meta)]
+    found = files_named(root, names, "file_path", files, others)
+    return {name: found.get(name) or inside(root, name.replace("\\", "/"), "file_path") for name in names}
+
+
+def _written(meta: dict[str, Any]) -> list[str]:
+    frames = (frame for frame in meta["frames"] if isinstance(frame, dict))
+    return [name for frame in frames if isinstance(name := _told(frame, _FILE), str) and name]
+
+
 def _read_frames(
-    root: Path, file: str, meta: dict[str, Any], files: Named, listed: Callable[[], frozenset[Path]]
+    root: Path, file: str, meta: dict[str, Any], paths: dict[str, Path]
 ) -> tuple[list[Photo], dict[str, str]]:
     """The photos of a file, and their names by what the file calls them."""
     photos, called = list[Photo](), dict[str, str]()
@@ -148,7 +163,7 @@ def _read_frames(
         if not isinstance(frame, dict):
             raise ValueError(f"{where}: expected an object, got {frame!r:.80}")
         written = _text(_told(frame, _FILE), "file_path", where)
-        path = _photo_path(root, written, files, listed)
+        path = paths[written]
         name = path.relative_to(root).as_posix()
         called[written] = name
         where = f"{where} ({name})"
@@ -187,48 +202,6 @@ def _once(root: Path, photos: list[Photo]) -> list[Photo]:
         if not np.allclose(first.viewmat, photo.viewmat, equal_nan=True):
             raise ValueError(f"{root}: photo {photo.name!r} appears more than once, with different poses")
     return [*found.values()]
-
-
-def _photo_path(root: Path, file_path: str, files: Named, listed: Callable[[], frozenset[Path]]) -> Path:
-    """The photo of `file_path`, which may lack its suffix (Blender sets); its place, if it is gone.
-
-    That of another frame, which lies where it should, is not taken for it: rigs and splits repeat names.
-    """
-    if (there := _written_photo(root, file_path)) is not None:
-        return there
-    if (found := files.find(file_path, lambda path: path in listed())) is not None:
-        return found
-    try:
-        return inside(root, file_path.replace("\\", "/"), "file_path")
-    except ValueError:
-        if (found := files.find(file_path)) is None:  # else the same photo, written otherwise
-            raise
-        return found
-
-
-def _written_photo(root: Path, file_path: str) -> Path | None:
-    """The file where `file_path` says that it is; None: there is none."""
-    written = file_path.replace("\\", "/")
-    for name in dict.fromkeys((file_path, written)):
-        try:
-            path = inside(root, name, "file_path")
-        except ValueError:
-            continue
-        for option in (path, *(path.with_name(path.name + s) for s in PHOTO_SUFFIXES)):
-            if os.path.lexists(option) and not option.is_dir():
-                return option
-    return None
-
-
-def _listed(root: Path) -> frozenset[Path]:
-    """The photos of all files of frames that lie where those say."""
-    metas = list[dict[str, Any]]()
-    for name in (SINGLE, TRAIN, TEST, VAL):
-        with suppress(OSError, ValueError):  # of one that is not there, or is not read
-            metas.append(_read(root / name))
-    frames = [frame for meta in metas for frame in meta["frames"] if isinstance(frame, dict)]
-    written = {text for frame in frames if isinstance(text := _told(frame, _FILE), str)}
-    return frozenset(path for text in written if (path := _written_photo(root, text)) is not None)
 
 
 def _mask_path(root: Path, written: str) -> Path | None:
