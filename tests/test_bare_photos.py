@@ -231,7 +231,7 @@ def test_the_world_stands_upright_and_every_photo_is_named(photos: list[np.ndarr
     assert set(report.lost) == {"foreign.png"}
     assert f"foreign.png ({report.lost['foreign.png']})" in str(report)
     assert report.advice is not None
-    assert "Take sharp, bright photos again where these were taken: foreign.png" in report.advice
+    assert "Take these photos again, sharp and bright: foreign.png" in report.advice
     assert "zz.png (no picture)" in str(report)
     views = [*scene.train, *scene.test]
     assert {view.quarter_turns for view in views} == {1}
@@ -294,10 +294,10 @@ def test_a_failure_tells_blur_no_overlap_and_too_few_photos_apart() -> None:
     assert "blurred or dark" in blurred
     apart = why_no_model(20, passes(3000, [12, 9]))
     assert "0 of 190 pairs" in apart
-    assert "no overlap" in apart
+    assert "do not overlap" in apart
     assert "too few photos" in why_no_model(4, passes(3000, [120, 90], 4))
     assert "taken from one place" in why_no_model(20, passes(3000, [900] * 100))
-    assert "20 photos show few" not in why_few(20, passes(3000, [900] * 100, registered=8))
+    assert "20 photos have few" not in why_few(20, passes(3000, [900] * 100, registered=8))
     assert "overlap too little" in why_few(20, passes(3000, [900] * 100, registered=8))
 
 
@@ -325,17 +325,19 @@ def test_each_lost_photo_is_told_why_and_what_to_take() -> None:
     one = Outcome(False, 9, features, [], [], best, apart=[["e", "x", "y"]])
     lost = {name: why_lost(name, one) for name in "bcdefh"}
     assert lost == {
-        "b": "blurred, dark or bare: 40 features, half of the photos have 900",
-        "c": "alone: it matches no other photo",
-        "d": "no two photos agree: 60 matches at best, 9 of them bear each other out",
-        "e": "fits 2 photos that have no place either",
-        "f": "fits only photos that have no place either",
-        "h": "few matches agree: 40 with a photo that has a place",
+        "b": "blurred, dark or without texture: 40 features (median of all photos: 900)",
+        "c": "it matches no other photo",
+        "d": "60 matches with its best partner, of which only 9 fit one camera geometry",
+        "e": "it only matches 2 photos that have no pose either",
+        "f": "it only matches photos that have no pose either",
+        "h": "too few matches (40) with photos that have a pose",
     }
     assert what_to_take({name: lost[name] for name in "bch"}, "abcdefgh", []) == (
-        "take sharp, bright photos again where these were taken: b; take photos between a and c, g and h"
+        "take these photos again, sharp and bright: b; take photos between a and c, g and h"
     )
-    assert what_to_take({"e": lost["e"]}, "abcdefgh", one.apart).startswith("1 photos fit each other but not")
+    assert what_to_take({"e": lost["e"]}, "abcdefgh", one.apart).startswith(
+        "1 photos match each other but no"
+    )
     assert what_to_take({}, "abc", []) == ""
 
 
@@ -348,9 +350,9 @@ def test_two_captures_in_one_folder_are_told_apart(photos: list[np.ndarray], tmp
     report = load_scene(tmp_path, test_every=3).sfm
     assert report is not None
     assert report.not_registered == ["b0.png", "b1.png", "b2.png"]
-    assert set(report.lost.values()) == {"fits 2 photos that have no place either"}
+    assert set(report.lost.values()) == {"it only matches 2 photos that have no pose either"}
     assert report.advice is not None
-    assert "3 photos fit each other but not the rest (b0.png, b1.png, b2.png)" in report.advice
+    assert "3 photos match each other but no others (b0.png, b1.png, b2.png)" in report.advice
 
 
 def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.CaptureFixture[str]) -> None:
@@ -371,8 +373,8 @@ def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.Capt
     text = expected_time(np.tile([4000, 3000], (200, 1)), None, 2)
     _, last, all_passes = map(int, re.findall(r"(\d+)(?: minutes| to)", text))
     assert all_passes == 4 * last
-    assert text.startswith("200 photos of 12.0 megapixels, which COLMAP sees at 1.9: ")
-    assert text.endswith("; 100 photos are plenty for most scenes")
+    assert text.startswith("200 photos of 12.0 megapixels, scaled down for COLMAP to 1.9: ")
+    assert text.endswith("; 100 photos are enough for most scenes")
     with LoadingScreen() as screen:
         screen.stage(Stage("COLMAP", 0, 200, text))
     assert capsys.readouterr().err.splitlines() == [text]

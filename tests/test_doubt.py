@@ -31,5 +31,5 @@ def test_wrong_places_are_told_by_the_matches_that_they_contradict(tmp_path: Pat
     wrong = borne_out(tmp_path / "colmap.db", model)
     assert 0.5 < wrong < 0.85  # those of 24 of 40 pairs are as they were
     one = Outcome(False, 10, {}, [], [], borne_out=wrong)
-    assert f"bear out only {wrong:.0%} of the matches" in why_doubtful(one)
+    assert f"only {wrong:.0%} of the matches between panoramas fit them" in why_doubtful(one)
     assert why_doubtful(replace(one, borne_out=right)) == why_doubtful(replace(one, borne_out=None)) == ""

@@ -42,8 +42,8 @@ def test_of_copies_one_is_used_and_the_others_are_named(tmp_path: Path) -> None:
     assert photos.names == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg", "close.png", "closer.png"]
     assert len(photos.sizes) == len(photos.exif) == 5
     assert photos.notes == [
-        "5 photos, 3 of them of 1 cameras by EXIF, 2 copies left out",
-        "2 of 7 photos are copies of others and were left out: IMG_1 (1).jpg (of IMG_1.jpg), "
+        "5 photos, 3 of them by 1 cameras in EXIF, 2 duplicates not used",
+        "2 of 7 photos are duplicates and are not used: IMG_1 (1).jpg (of IMG_1.jpg), "
         "WhatsApp.jpg (of IMG_2.jpg)",
     ]
     assert stages[-1].note == photos.notes[0]
@@ -68,7 +68,7 @@ def test_photos_deeper_than_those_that_are_used_are_told(tmp_path: Path) -> None
         picture(k).save(tmp_path / folder / f"{k}.png")
     photos = looked_at(tmp_path)
     assert photos.names == ["0.png", "1.png"]
-    assert any(note.startswith("photos not used are in two/inner (1): put") for note in photos.notes)
+    assert any(note.startswith("not used: photos in two/inner (1). Put") for note in photos.notes)
 
 
 def test_frames_of_a_film_that_stands_still_all_stay(tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_photos_in_folders_below_others_are_told(tmp_path: Path) -> None:
     picture(5).save(tmp_path / "masks" / "0.png")
     assert looked_at(tmp_path).notes == [
         "3 photos, no camera in EXIF",
-        "photos not used are in copy (1), more (2): put those of one scene into one folder to use them",
+        "not used: photos in copy (1), more (2). Put all photos of one scene into one folder to use them",
     ]
     for k in range(3):
         (tmp_path / f"{k}.jpg").unlink()

@@ -40,8 +40,10 @@ def test_places_that_photos_bear_out_are_told_from_others(made: Made) -> None:  
     one = Outcome(False, 8, {}, [], [], agree={name: list(counts) for name, counts in told.items()})
     assert doubtful(one) == ["3.png"]
     looked, agreed, beside = told["3.png"]
-    said = f"The places of 1 photos are in doubt (tree.jpg): of {looked} points that one should show it shows"
-    assert f"{said} {agreed}, chance alone {beside}" in why_doubtful(one, lambda name: "tree.jpg")
+    said = f"The poses of 1 photos may be wrong (tree.jpg): of {looked} points that should be visible,"
+    assert f"{said} {agreed} are found, at random places {beside}" in why_doubtful(
+        one, lambda name: "tree.jpg"
+    )
     few = replace(one, agree={"3.png": [19, 0, 9]})
     assert doubtful(few) == []  # too little was looked for
 
@@ -160,5 +162,7 @@ def test_a_run_says_that_no_pose_can_be_trusted() -> None:
     )
     assert len(Model(model, [one]).poses()) == 4
     worse = replace(one, agree=one.agree | {"2.png": bad})
-    with pytest.raises(ValueError, match=r"no pose of these photos can be trusted\. The places of 3 photos"):
+    with pytest.raises(
+        ValueError, match=r"most poses of these photos are probably wrong\. The poses of 3 photos"
+    ):
         Model(model, [worse]).poses()

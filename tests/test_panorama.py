@@ -176,8 +176,8 @@ def test_panoramas_by_what_they_show_are_called_so_and_how_to_refuse_it(tmp_path
     assert found is not None
     photos = readable(found)
     assert photos.around
-    (said,) = [note for note in photos.notes if "by what they show" in note]
-    assert said.startswith("5 photos are taken for panoramas of 360 x 180 degrees")
+    (said,) = [note for note in photos.notes if "look like panoramas" in note]
+    assert said.startswith("5 photos look like panoramas of 360 x 180 degrees")
     for file in tmp_path.iterdir():  # as the note says
         with Image.open(file) as photo:
             photo.crop((0, 0, 512, 255)).save(file)
@@ -297,7 +297,7 @@ def test_what_is_no_walk_of_panoramas_is_refused_by_name(tmp_path: Path) -> None
     with pytest.raises(ValueError, match=r"1 panorama of 360 x 180 degrees \(hall\.jpg\) show.* at least 3"):
         look(tmp_path / "one")
     save(tmp_path / "parts", "a.jpg b.jpg", (90, 30), xmp=TAG)
-    with pytest.raises(ValueError, match=r"2 of 2 photos say .* \(a\.jpg: 90 x 30 px\)"):
+    with pytest.raises(ValueError, match=r"2 of 2 photos are tagged .* \(a\.jpg: 90 x 30 px\)"):
         look(tmp_path / "parts")
 
 

@@ -135,12 +135,12 @@ def test_the_report_says_how_far_they_are_off(cards: Scene, found: Scene) -> Non
     assert 0 < min(report.sure_px.values()) <= max(report.sure_px.values()) < 0.5
     assert report.auc is not None
     assert 0.5 < report.auc["1"] < report.auc["3"] < report.auc["5"] < 1
-    assert "poses are sure to" in str(report)
+    assert "poses are exact to" in str(report)
     json.dumps(asdict(report), allow_nan=False)
     assert found.notes == [*cards.notes, str(report)]
     assert "7 of 7 registered" in str(report)
     behind = str(replace(report, own_cameras_px=None))
-    assert "its own cameras see the new points behind them" in behind
+    assert "the scene's own cameras see the new points behind them" in behind
 
 
 def test_no_thread_and_no_held_out_view_changes_a_bit(cards: Scene, found: Scene) -> None:
@@ -246,7 +246,7 @@ def test_photos_that_make_no_scene_are_refused(cards: Scene, monkeypatch: pytest
         sfm_scene(replace(cards, train=cards.train[:2]))
     flat = [replace(view, image=np.full_like(view.image, 90)) for view in cards.train[:4]]
     with pytest.raises(
-        ValueError, match=r"no two of the 4 photos.* found 0 features .* mean blurred or dark"
+        ValueError, match=r"no poses for these 4 photos.* found 0 features .* photos are blurred or dark"
     ):
         sfm_scene(replace(cards, train=flat))
     rng = np.random.default_rng(0)
@@ -276,7 +276,7 @@ def test_a_folder_of_photos_alone_becomes_a_scene(cards: Scene, tmp_path: Path) 
     assert [view.name for view in scene.test] == ["photo 0.png", "photo 8.png"]
     assert len(scene.train) == 7
     assert scene.source == "photos"
-    assert "from all photos (9 of 9 registered), the held-out views among them" in scene.notes[0]
+    assert "from all photos, held-out ones too (9 of 9 registered)" in scene.notes[0]
     assert scene.tracks is not None
     assert scene.tracks.error < 1
     assert scene.seen is not None

@@ -157,11 +157,11 @@ def test_the_pass_whose_model_it_is_is_told() -> None:
     plain = Outcome(False, 10, {"a": 500, "b": 500}, [], [])
     tolerant = Outcome(True, 9, {"a": 500, "b": 500}, [], [], agree={"a": [40, 6, 5]})
     model = Model(None, [plain, tolerant], chosen=1)  # pyright: ignore[reportArgumentType]
-    assert "of 40 points that one should show it shows 6" in why_doubtful(model.passes[model.chosen])
+    assert "of 40 points that should be visible, 6 are found" in why_doubtful(model.passes[model.chosen])
     group = replace(plain, best={"a": [90, 80, 0]}, apart=[["a", "b", "c"]])
-    assert why_lost("a", group) == "fits 2 photos that have no place either"
-    assert why_lost("a", group, {"b"}) == "fits one that has no place"
-    assert why_lost("a", group, {"b", "c"}) == "fits only photos that have no place either"
+    assert why_lost("a", group) == "it only matches 2 photos that have no pose either"
+    assert why_lost("a", group, {"b"}) == "it only matches one photo, which has no pose either"
+    assert why_lost("a", group, {"b", "c"}) == "it only matches photos that have no pose either"
 
 
 def test_photos_without_a_feature_have_no_likely_pairs(monkeypatch: pytest.MonkeyPatch) -> None:

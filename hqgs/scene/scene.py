@@ -186,22 +186,22 @@ class SfmReport:
         text = self._found() if self.rotation_error_deg is None else self._compared()
         if self.first_pass is not None:
             text += (
-                f"; a first pass had registered {self.first_pass}, a second and more tolerant one the rest"
+                f"; a first pass registered {self.first_pass}, a second pass with weaker limits the others"
             )
         if self.not_registered:
             names = [
                 f"{name} ({self.lost[name]})" if name in self.lost else name for name in self.not_registered
             ]
-            text += f"; {len(names)} left out, as COLMAP found no place for them: {some(names)}"
+            text += f"; {len(names)} left out, as COLMAP found no pose for them: {some(names)}"
         if self.sure_px:
             name, least = max(self.sure_px.items(), key=lambda item: item[1])
             usual = float(np.median(list(self.sure_px.values())))
             text += (
-                f"; poses are sure to {usual:.2f} px (median), the least sure, of {name}, to {least:.2f} px"
+                f"; poses are exact to {usual:.2f} px (median), the least exact, of {name}, to {least:.2f} px"
             )
         if self.unreadable:
             files = ", ".join(f"{name} ({why})" for name, why in self.unreadable.items())
-            text += f"; left out, as they cannot be read ({len(self.unreadable)}): {files}"
+            text += f"; {len(self.unreadable)} left out, as they cannot be read: {files}"
         if self.advice is not None:
             text += f". {self.advice}"
         return text
@@ -209,9 +209,9 @@ class SfmReport:
     def _found(self) -> str:
         registered = self.photos - len(self.not_registered)
         return (
-            f"cameras and points by COLMAP from all photos ({registered} of {self.photos} registered), the "
-            f"held-out views among them; {self.points} points, {self.track_length:.1f} photos a point, "
-            f"{self.reprojection_error_px:.2f} px of the stored photos off (mean)"
+            f"cameras and points by COLMAP from all photos, held-out ones too ({registered} of {self.photos} "
+            f"registered); {self.points} points, {self.track_length:.1f} photos per point, mean error "
+            f"{self.reprojection_error_px:.2f} px of the stored photos"
         )
 
     def _compared(self) -> str:
@@ -219,21 +219,21 @@ class SfmReport:
         assert rotation is not None
         assert translation is not None
         found = self.photos - len(self.not_registered)
-        seen = "behind them: the files may mean other axes of a camera than they are read with"
+        seen = "behind them: the files may use another convention of camera axes"
         if self.own_cameras_px is not None:
             seen = f"{self.own_cameras_px:.2f} px off the photos (median)"
         text = (
             f"poses and points by COLMAP from the training photos: {found} of {self.photos} registered; "
-            f"rotations off the scene's own by {rotation['median']:.3f} deg (median) and "
-            f"{rotation['max']:.3f} deg (max), centres by {translation['median']:.2%} and "
-            f"{translation['max']:.2%} of the extent, so that its own cameras see the new points "
-            f"{seen}; {self.points} points, its own "
-            f"{self.own_points}, the nearest {self.point_distance:.2%} of the extent away (median); "
-            f"{self.track_length:.1f} photos a point, {self.reprojection_error_px:.2f} px off (mean)"
+            f"rotations differ from the scene's own by {rotation['median']:.3f} deg (median) and "
+            f"{rotation['max']:.3f} deg (max), camera centres by {translation['median']:.2%} and "
+            f"{translation['max']:.2%} of the extent; the scene's own cameras see the new points "
+            f"{seen}; {self.points} points (own: {self.own_points}), the nearest own point "
+            f"{self.point_distance:.2%} of the extent away (median); "
+            f"{self.track_length:.1f} photos per point, mean error {self.reprojection_error_px:.2f} px"
         )
         if self.auc is not None:
             within = ", ".join(f"{value:.2f} at {limit} deg" for limit, value in self.auc.items())
             text += f"; AUC {within}"
         if self.own_track_length is not None:
-            text += f", its own {self.own_track_length:.1f} and {self.own_reprojection_error_px:.2f} px"
+            text += f" (own: {self.own_track_length:.1f} and {self.own_reprojection_error_px:.2f} px)"
         return text

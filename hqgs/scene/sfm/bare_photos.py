@@ -183,11 +183,11 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
         if not place.name.startswith(sizes)
     ]:
         notes.append(
-            f"photos not used are in {some(told)}: put those of one scene into one folder to use them"
+            f"not used: photos in {some(told)}. Put all photos of one scene into one folder to use them"
         )
     if maps:
         told = some([place.relative_to(root).as_posix() for place in maps])
-        notes.append(f"not taken for photos, by the names of their folders: {told}")
+        notes.append(f"these folders are not read, as their names say that they hold no photos: {told}")
     names = [(place / name).relative_to(folder).as_posix() for place in used for name in used[place]]
     masks = masks_among(names)
     names = [name for name in names if name not in masks]
@@ -208,23 +208,23 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     twice = {} if film else copies(photos.folder, looked, tags)
     if twice:
         pairs = some([f"{name} (of {own})" for name, own in twice.items()])
-        notes.append(f"{len(twice)} of {len(looked)} photos are copies of others and were left out: {pairs}")
+        notes.append(f"{len(twice)} of {len(looked)} photos are duplicates and are not used: {pairs}")
         looked = {name: seen for name, seen in looked.items() if name not in twice}
     if film and frames_around(photos.folder):
         tags = {name: replace(tag, panorama=True) for name, tag in tags.items()}
     sphere, aside = all_around(photos.folder, looked, {name: tags[name] for name in looked})
     if aside:
-        kind = "flat, most are not" if sphere else "panoramas of 360 x 180 degrees, most are not"
+        kind = "flat, unlike most" if sphere else "panoramas of 360 x 180 degrees, unlike most"
         notes.append(
-            f"{len(aside)} of {len(looked)} photos are {kind}, and were left out: {some(aside)}; they need a "
-            "folder of their own"
+            f"{len(aside)} of {len(looked)} photos are {kind}, and not used: {some(aside)}. Put them into "
+            "a folder of their own"
         )
         looked = {name: seen for name, seen in looked.items() if name not in set(aside)}
     exif = [tags[name] for name in looked]
     if sphere and (untold := [name for name in looked if not tags[name].panorama]):
         notes.append(
-            f"{len(untold)} photos are taken for panoramas of 360 x 180 degrees by what they show, no file "
-            f"says it ({some(untold)}): if they are flat, cut a row off each, so that it is not 2:1"
+            f"{len(untold)} photos look like panoramas of 360 x 180 degrees; their files do not say so "
+            f"({some(untold)}). If they are flat photos, cut one row off each, so that they are not 2:1"
         )
     if not film or sphere:
         told = profiles.told({name: seen.colors for name, seen in looked.items()})
@@ -284,9 +284,9 @@ def _understood(exif: list[Exif], copies: int, around: bool) -> str:
     located = sum(tags.gps is not None for tags in exif)
     parts = [f"{len(exif)} {'panoramas of 360 x 180 degrees' if around else 'photos'}"]
     parts += [
-        f"{len(cameras)} of them of {len(set(cameras))} cameras by EXIF" if cameras else "no camera in EXIF"
+        f"{len(cameras)} of them by {len(set(cameras))} cameras in EXIF" if cameras else "no camera in EXIF"
     ]
-    parts += [f"{copies} copies left out"] if copies else []
+    parts += [f"{copies} duplicates not used"] if copies else []
     parts += [f"GPS in {located}"] if located else []
     return ", ".join(parts)
 

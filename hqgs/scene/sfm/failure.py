@@ -41,22 +41,22 @@ def why_no_model(photos: int, passes: Sequence[Outcome]) -> str:
     """Why no model could be started, with counts, and what to do; a sentence or two for the user."""
     found = counts(photos, passes)
     last = passes[-1]
-    told = f"COLMAP could start from no two of the {photos} photos. {found}. "
+    told = f"COLMAP found no poses for these {photos} photos. {found}. "
     if _is_poor(passes[0]):
         return told + (
-            "So few features mean blurred or dark photos, or bare surfaces: take sharp photos of things with "
-            "texture"
+            "So few features mean that photos are blurred or dark, or surfaces have no texture: take sharp "
+            "photos of things with texture"
         )
     if _pairs(last) == 0:
         return told + (
-            "The photos are rich in detail but show different things: no overlap. Take each photo so that it "
-            "shares two thirds of its picture with the next one"
+            "The photos have enough detail, but do not overlap. Take each photo so that two thirds of it "
+            "show what the next photo shows"
         )
     if photos < 10:
-        return told + "That is too few photos: take 20 to 100, a step apart, each overlapping the next"
+        return told + "There are too few photos: take 20 to 100, a step apart, each overlapping the next"
     return told + (
-        "Photos overlap, but were taken from one place, or lie too far apart: walk around the scene, a step "
-        "between photos"
+        "The photos overlap, but were taken from one place, or from places too far apart: walk around the "
+        "scene and take a photo at each step"
     )
 
 
@@ -65,11 +65,11 @@ def why_few(photos: int, passes: Sequence[Outcome]) -> str:
     first = passes[0]
     poor = sorted(name for name, count in first.features.items() if count < FEW_FEATURES)
     if _is_poor(first):
-        advice = "the photos are blurred, dark or without texture: take sharper ones"
+        advice = "the photos are blurred or dark, or show no texture: take sharper ones"
     elif poor and 2 * len(poor) >= photos - max(one.registered for one in passes):
-        advice = f"{len(poor)} photos show few features (blurred, dark or bare surfaces)"
+        advice = f"{len(poor)} photos have few features (blurred, dark, or surfaces without texture)"
     else:
-        advice = "the others overlap too little with these: take more photos in between"
+        advice = "the other photos overlap too little with these: take more photos in between"
     return f"{counts(photos, passes)}; {advice}"
 
 
@@ -78,33 +78,35 @@ def why_lost(name: str, one: Outcome, placed: Container[str] = ()) -> str:
     features, usual = one.features[name], float(np.median(list(one.features.values())))
     matches, inliers, with_placed = one.best[name]
     if features < max(FEW_FEATURES, POOR * usual):
-        return f"blurred, dark or bare: {features:,} features, half of the photos have {usual:,.0f}"
+        return f"blurred, dark or without texture: {features:,} features (median of all photos: {usual:,.0f})"
     if matches < MATCHES:
-        return "alone: it matches no other photo"
+        return "it matches no other photo"
     if inliers < MATCHES:
-        return f"no two photos agree: {matches} matches at best, {inliers} of them bear each other out"
+        return f"{matches} matches with its best partner, of which only {inliers} fit one camera geometry"
     group = next((group for group in one.apart if name in group), [])
     if others := sum(other not in placed for other in group if other != name):
         return (
-            f"fits {others} photos that have no place either" if others > 1 else "fits one that has no place"
+            f"it only matches {others} photos that have no pose either"
+            if others > 1
+            else "it only matches one photo, which has no pose either"
         )
     if with_placed < MATCHES:
-        return "fits only photos that have no place either"
-    return f"few matches agree: {with_placed} with a photo that has a place"
+        return "it only matches photos that have no pose either"
+    return f"too few matches ({with_placed}) with photos that have a pose"
 
 
 def what_to_take(lost: Mapping[str, str], names: Sequence[str], apart: Sequence[Sequence[str]]) -> str:
     """What to photograph so that the lost photos, by `why_lost`, find a place; `names`: of all, sorted."""
     captures = [[name for name in group if name in lost] for group in apart]
     said = [
-        f"{len(group)} photos fit each other but not the rest ({some(group)}): another scene belongs into a "
-        "folder of its own, the same scene needs photos in between"
+        f"{len(group)} photos match each other but no others ({some(group)}): put another scene into its own "
+        "folder; for the same scene, take photos in between"
         for group in captures
         if group
     ]
     others = [name for name in lost if not any(name in group for group in captures)]
     if blurred := [name for name in others if lost[name].startswith("blurred")]:
-        said.append(f"take sharp, bright photos again where these were taken: {some(blurred)}")
+        said.append(f"take these photos again, sharp and bright: {some(blurred)}")
     if loose := [name for name in others if name not in blurred]:
         between = []
         for name in loose:
@@ -129,22 +131,22 @@ def why_doubtful(one: Outcome, called: Callable[[str], str] = str) -> str:
     if one.loose and not doubtful(one):
         parts = [f"{some([called(name) for name in part])} by {points} points" for part, points in one.loose]
         return (
-            "Places are in doubt where photos hang on few points that they share with the rest: "
+            "Poses may be wrong where photos share only few points with the others: "
             f"{'; '.join(parts)}. Take photos between these and the others"
         )
     if wrong := doubtful(one):
         looked, agreed, beside = np.median([one.agree[name] for name in wrong], axis=0)
         return (
-            f"The places of {len(wrong)} photos are in doubt ({some([called(name) for name in wrong])}): of "
-            f"{looked:.0f} points that one should show it shows {agreed:.0f}, chance alone {beside:.0f} "
-            "(medians). Take photos between these and the others, sharper and larger ones"
+            f"The poses of {len(wrong)} photos may be wrong ({some([called(name) for name in wrong])}): of "
+            f"{looked:.0f} points that should be visible, {agreed:.0f} are found, at random places "
+            f"{beside:.0f} (medians). Take sharper, larger photos between these and the others"
         )
     if one.borne_out is None or one.borne_out >= BORNE_OUT:
         return ""
     return (
-        f"Places may be wrong: they bear out only {one.borne_out:.0%} of the matches between panoramas "
-        f"(right ones {BORNE_OUT:.0%} and more). Give the panoramas at their full size, or take more, closer "
-        "together, where floors and walls repeat less"
+        f"Poses may be wrong: only {one.borne_out:.0%} of the matches between panoramas fit them (usually "
+        f"{BORNE_OUT:.0%} and more). Use the panoramas at full size, or take more of them, closer together, "
+        "where floors and walls look less alike"
     )
 
 
@@ -153,11 +155,11 @@ def counts(photos: int, passes: Sequence[Outcome]) -> str:
     first, pairs = passes[0], photos * (photos - 1) // 2
     features = list(first.features.values()) or [0]
     found = (
-        f"It found {int(np.median(features)):,} features in a photo (median; fewest {min(features):,}), and "
+        f"It found {int(np.median(features)):,} features per photo (median; fewest {min(features):,}), and "
         f"{_pairs(first):,} of {pairs:,} pairs of photos match (most matches: {max([0, *first.inliers]):,})"
     )
     if len(passes) > 1:
-        found += f"; in a second, more tolerant pass {_pairs(passes[1]):,} pairs"
+        found += f"; in a second pass with weaker limits {_pairs(passes[1]):,} pairs"
     return found
 
 

@@ -50,7 +50,7 @@ def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -
         name = tagged[0]
         width, height = looked[name].size
         raise ValueError(
-            f"{folder}: {len(tagged)} of {len(looked)} photos say that they are panoramas, but are not twice "
+            f"{folder}: {len(tagged)} of {len(looked)} photos are tagged as panoramas, but are not twice "
             f"as wide as high ({name}: {width} x {height} px): export the whole sphere, 360 x 180 degrees"
         )
     flat = [name for name in looked if name not in set(found)]

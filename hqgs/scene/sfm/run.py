@@ -54,9 +54,9 @@ STAGES = {
     "matches": "COLMAP: pairs of photos matched",
     "verify": "COLMAP: matches checked",
     "place": "COLMAP: photos placed",
-    "home": "COLMAP: photos without a place looked for",
+    "home": "COLMAP: poses of the remaining photos",
     "agree": "COLMAP: places checked",
-    "sharpen": "COLMAP: places made precise",
+    "sharpen": "COLMAP: poses refined",
 }
 
 
@@ -91,7 +91,7 @@ class Model:
                 f"{LEAST_SHARE:.0%}. {why_few(photos, self.passes)}. {self._to_take()}".strip()
             )
         if 2 * len(doubtful(self._chosen)) > len(poses):
-            raise ValueError(f"no pose of these photos can be trusted. {self.advice()}")
+            raise ValueError(f"most poses of these photos are probably wrong. {self.advice()}")
         return poses
 
     @property
@@ -146,13 +146,13 @@ def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: 
         most = share * (1.1 * seen.sum() + 0.03 * pairs) + 0.02 * pairs + 0.4 * count
     if most < LONG:
         return ""
-    shrunk = f", which COLMAP sees at {seen.mean():.1f}" if seen.mean() < 0.9 * stored.mean() else ""
-    advice = "; 100 photos are plenty for most scenes" if count > MANY else ""
+    shrunk = f", scaled down for COLMAP to {seen.mean():.1f}" if seen.mean() < 0.9 * stored.mean() else ""
+    advice = "; 100 photos are enough for most scenes" if count > MANY else ""
     return (
         f"{count} photos of {stored.mean():.1f} megapixels{shrunk}: finding their cameras takes "
         f"{max(1, round(least / 60))} to {max(2, round(most / 60))} minutes on {threads} "
-        f"thread{'s' * (threads > 1)}, more the more detail they show; where photos find no place, smoothed "
-        f"copies are looked at as well: up to {AGAIN * max(2, round(most / 60))} minutes in all{advice}"
+        f"thread{'s' * (threads > 1)}; where photos find no pose, COLMAP also tries smoothed copies, up to "
+        f"{AGAIN * max(2, round(most / 60))} minutes in all{advice}"
     )
 
 
