@@ -3,9 +3,8 @@
     python scripts/network_model.py     # prints how many times as fast
 
 Of one view a rank computes for a + b M seconds of one core, where M Gaussians are visible: the line through
-two sizes of `docs/results/speed.csv`. To each of the P - 1 others it sends 60 M bytes, 12 M of them first.
-Views of a rank follow each other, and a view's bytes travel while the next one is computed; those of the last
-one while the harmonics are updated, but for the first message.
+two sizes of `docs/results/speed.csv`. To each of the P - 1 others it sends 64 M bytes.
+Views of a rank follow each other, and a view's bytes travel while the next one is computed.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 SPEED = ROOT / "docs" / "results" / "speed.csv"
-BYTES, FIRST = 60, 12  # of a visible Gaussian; of them in the first message
+BYTES = 64  # of a visible Gaussian
 RATES = 1e9, 10e9, 25e9  # bit/s
 SIZES = 100_000, 1_000_000, 10_000_000
 RANKS = 2, 4, 16, 64
@@ -61,9 +60,7 @@ class Model:
             self.transfer(visible, ranks, rate),
             self.update(visible, ranks),
         )
-        first = sent * FIRST / BYTES
-        computed = VIEWS * view + first + max(update, sent - first)
-        return max(computed, view + VIEWS * sent + update / 2)
+        return view + max((VIEWS - 1) * view + sent, VIEWS * sent) + update
 
     def gain(self, visible: int, ranks: int, rate: float) -> float:
         """Times as fast as one machine."""

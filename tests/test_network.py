@@ -34,7 +34,7 @@ def test_namespaces_need_root(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
 def test_the_model_follows_its_words(capsys: pytest.CaptureFixture[str]) -> None:
     model = Model(fixed=0.1, each=1e-6, cores=2)
     assert model.view(900_000) == pytest.approx(0.5)
-    assert model.transfer(1_000_000, ranks=3, rate=1e9) == pytest.approx(0.96)
+    assert model.transfer(1_000_000, ranks=3, rate=1e9) == pytest.approx(1.024)
     assert model.gain(1_000, ranks=4, rate=1e15) == pytest.approx(4, rel=0.02)
     assert model.gain(10_000_000, ranks=2, rate=1e6) < 0.01
     gains = [model.gain(1_000_000, 4, rate) for rate in (1e9, 1e10, 1e11)]

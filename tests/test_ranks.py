@@ -29,7 +29,7 @@ from hqgs.base.files import CHECKPOINT, PLY
 from hqgs.base.ranks import ALONE, RankError, joined
 from hqgs.cli.main import main
 from hqgs.training.adam import Adam
-from hqgs.training.batch import Part, Rest, give_harmonics, give_others, part_of, to_rasterize
+from hqgs.training.batch import Part, give_harmonics, give_others, part_of, to_rasterize
 from hqgs.training.config import DensifyConfig, TrainConfig
 from hqgs.training.forward import TrainingViews
 from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, Fault
@@ -194,22 +194,18 @@ def test_gradients_are_those_of_the_mean_of_the_losses() -> None:
     assert len(plans) == 4
     assert plans[0].degree == 3
     training = TrainingViews(scene.train, ThreeDGS(), config.background)
-    parts, rests = list[Part](), list[Rest]()
+    parts = list[Part]()
     for plan in plans:
         forward = training.at(plan, to_rasterize(gaussians, gaussians), 0)
         assert forward.backward(trainer.state) is None
         assert gaussians.shN.grad is None  # it is made of sh0's
-        part, rest = part_of(forward, None, gaussians, optimizer)
-        m, bits = len(part.rows), len(gaussians) / 8
-        assert len(part.packed()) == pytest.approx(4 * 3 * m + bits, abs=500)  # a colour
-        assert len(rest().packed()) == pytest.approx(
-            4 * (3 + 3 + 4 + 1 + 1) * m, abs=500
-        )  # all others, and what growth goes by
+        part = part_of(forward, None, gaussians, optimizer)
+        # Its number, a colour, all others, and what growth goes by.
+        assert len(part.packed()) == pytest.approx(4 * (1 + 3 + 3 + 3 + 4 + 1 + 1) * len(part.rows), abs=800)
         parts.append(Part.unpacked(part.packed()))
-        rests.append(Rest.unpacked(rest().packed()))
     optimizer.zero_grad()
-    give_harmonics(parts, [rest.higher for rest in rests], gaussians, gaussians)
-    assert set(give_others(parts, rests, gaussians, optimizer).values()) == {4}
+    give_harmonics(parts, gaussians, gaussians)
+    assert set(give_others(parts, gaussians, optimizer).values()) == {4}
     ours = {name: tensor.grad for name, tensor in gaussians.named().items()}
     optimizer.zero_grad()
     torch.stack([training.at(plan, gaussians, 0).loss for plan in plans]).mean().backward()
@@ -229,24 +225,24 @@ def test_a_part_comes_back_with_the_same_bits() -> None:
         measured=torch.tensor([math.pi], dtype=torch.float64),
         fault=Fault("gradient", ["means", "sh0"], rows, 3),
         center=torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64),
-        shown=torch.tensor([k in (1, 5) for k in range(11)]),
+        rows=torch.tensor([1, 5], dtype=torch.int32),
         colors=torch.tensor([[1e-40, -0.0, 1.0], [3.0, 4.0, 5.0]]),
+        values=torch.tensor([[1e-40, -0.0]]),
+        own={"paths.3": torch.ones(2, 6, dtype=torch.float64)},
     )
-    rest = Rest(torch.tensor([[1e-40, -0.0]]), None, {"paths.3": torch.ones(2, 6, dtype=torch.float64)})
-    back, rest_back = Part.unpacked(part.packed()), Rest.unpacked(rest.packed())
+    back = Part.unpacked(part.packed())
     assert (back.loss, back.degree) == (part.loss, 2)
     assert back.fault is not None
     assert (back.fault.what, back.fault.tensors, back.fault.values) == ("gradient", ["means", "sh0"], 3)
     assert torch.equal(back.fault.rows, rows)
-    assert back.rows.tolist() == [1, 5]
+    names = ("measured", "center", "rows", "colors", "values")
     for there, here in [
-        *((getattr(back, name), getattr(part, name)) for name in ("measured", "center", "shown", "colors")),
-        (rest_back.values, rest.values),
-        (rest_back.own["paths.3"], rest.own["paths.3"]),
+        *((getattr(back, name), getattr(part, name)) for name in names),
+        (back.own["paths.3"], part.own["paths.3"]),
     ]:
         assert there.dtype == here.dtype
         assert there.numpy().tobytes() == here.numpy().tobytes()
-    assert rest_back.higher is None
+    assert back.higher is None
 
 
 def test_steps_take_each_view_of_the_schedule_once() -> None:

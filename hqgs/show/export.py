@@ -10,8 +10,8 @@ Gaussian's opacity bounds its weight in a pixel. Renders of what was written, re
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -23,7 +23,7 @@ from hqgs.base.left_out import LeftOut
 from hqgs.model.formats.arrays import curve_order
 from hqgs.model.formats.beside import keep_world
 from hqgs.model.formats.files import FORMATS
-from hqgs.model.formats.spz import encode_spz, write_spz
+from hqgs.model.formats.spz import write_spz
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import RunCameras
@@ -60,11 +60,11 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
     reduced = steps[-1].gaussians if steps else gaussians
     clipped = _write(reduced, path, options)
     written, left_out = path.stat().st_size, list[LeftOut]()
-    sizes = [_size(g, options) for g in (gaussians, *(step.gaussians for step in steps[:-1])) if steps]
-    sizes.append(_size(reduced, options) if FORMATS[options.format].size else written)
-    for step, (before, after) in zip(steps, pairwise(sizes), strict=True):
-        saved = None if before is None or after is None else before - after
+    size, before = FORMATS[options.format].size, gaussians
+    for step in steps:
+        saved = None if size is None else _size(size, before) - _size(size, step.gaussians)
         left_out.append(LeftOut(step.what, step.why, step.evidence, bytes=saved))
+        before = step.gaussians
     if gaussians.antialiased and not FORMATS[options.format].antialiased:
         why = f"a .{options.format} file cannot store it; detail finer than a pixel is shown too opaque"
         left_out.append(LeftOut("the antialias flag", why))
@@ -177,16 +177,8 @@ def _write(gaussians: Gaussians, path: Path, options: ExportOptions) -> dict[str
     return clipped
 
 
-def _size(gaussians: Gaussians, options: ExportOptions) -> int | None:
-    """Bytes of the file without a header; None where SPZ cannot hold them, or SOG would take minutes."""
-    if size := FORMATS[options.format].size:
-        return size(len(gaussians), 3 * gaussians.shN.shape[1], gaussians.errors is not None)
-    if options.format != "spz":
-        return None
-    try:
-        return len(encode_spz(along_a_curve(gaussians).arrays(), options.sh_bits, options.spz_version).data)
-    except ValueError:
-        return None
+def _size(size: Callable[[int, int, bool], int], g: Gaussians) -> int:
+    return size(len(g), 3 * g.shN.shape[1], g.errors is not None)
 
 
 @dataclass(frozen=True)
