@@ -67,10 +67,10 @@ class Part:
     @staticmethod
     def unpacked(data: bytes) -> Part:
         tensors = load(data)
-        meta = json.loads(tensors["meta"].numpy().tobytes())
+        meta: dict[str, Any] = json.loads(tensors["meta"].numpy().tobytes())
         if (fault := meta["fault"]) is not None:
             meta["fault"] = Fault(fault[0], fault[1], tensors["culled"], fault[2])
-        sent = {name: tensors.get(name) for name in SENT}
+        sent: dict[str, Any] = {name: tensors.get(name) for name in SENT}
         return Part(**meta, **sent, own=checkpoint.part("own.", tensors))
 
 
