@@ -326,5 +326,5 @@ def _report(
     result = RunResult(record, views)
     report = measure(result) if out is None else write_report(out, result)
     if out is not None:
-        write_page(out / PAGE, Page(report, scene, model, views, diagnosis, out))
+        write_page(out / PAGE, Page(report, scene, model, views, diagnosis))
     return report

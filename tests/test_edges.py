@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from hqgs.photos.edges import edge_aware_map, edge_magnitude
+from hqgs.training.methods.paper import edge_aware_map, edge_magnitude
 
 
 def scipy_magnitude(image: NDArray[np.floating]) -> NDArray[np.float64]:

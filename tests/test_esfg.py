@@ -18,16 +18,21 @@ import hqgs
 import hqgs.training.densify as densify_module
 from hqgs.base.files import PLY
 from hqgs.model.gaussians import Gaussians
-from hqgs.photos.edges import edge_aware_map
 from hqgs.pipeline import open_run, run_to_end
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.adam import Adam
 from hqgs.training.config import DensifyConfig
 from hqgs.training.densify import Densifier
-from hqgs.training.methods import esfg as esfg_module
+from hqgs.training.methods import paper as esfg_module
 from hqgs.training.methods import paper as paper_module
-from hqgs.training.methods.esfg import ESFG
-from hqgs.training.methods.paper import SCS_CACHE_BYTES, PaperHQGS, scs_loss, scs_weights
+from hqgs.training.methods.paper import (
+    ESFG,
+    SCS_CACHE_BYTES,
+    PaperHQGS,
+    edge_aware_map,
+    scs_loss,
+    scs_weights,
+)
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.trainer import Trainer
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hqgs.photos.edges import edge_magnitude
-from hqgs.training.methods.paper import DIMMEST, scs_loss, scs_weights
+from hqgs.training.methods.paper import DIMMEST, edge_magnitude, scs_loss, scs_weights
 
 
 def loss_of(render: Tensor, target: Tensor, g: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -163,7 +163,6 @@ class Blur:
     kind: Kind
     amount: float  # px: sigma (gaussian), radius (defocus) or length (motion)
     sigma: float  # px: of the Gaussian as wide
-    confidence: float  # 0..1: that it is this kind
     direction: float | None = None  # of the motion, degrees from x towards y (down), 0..180
 
 
@@ -195,8 +194,8 @@ def estimate_blur(levels: Floats, noise: float) -> Blur | None:
     if motion is not None:
         return motion
     if defocus.cost < CLEARLY * gaussian.cost:
-        return Blur("defocus", radius, radius / 2, 1 - defocus.cost / gaussian.cost)
-    return Blur("gaussian", extra := extra_sigma(sigma), extra, max(0.0, 1 - gaussian.cost / defocus.cost))
+        return Blur("defocus", radius, radius / 2)
+    return Blur("gaussian", extra := extra_sigma(sigma), extra)
 
 
 def extra_sigma(sigma: float) -> float:
@@ -229,7 +228,7 @@ def _motion(spectrum: Spectrum, floor: float, sigma: float, radius: float) -> Bl
     if moved.cost >= CLEARLY * still:
         return None
     direction = float(np.rad2deg(angles[moved.best]) % 180)
-    return Blur("motion", length, length / 12**0.5, 1 - moved.cost / still, direction)
+    return Blur("motion", length, length / 12**0.5, direction)
 
 
 def _round_blurs(kind: Kind, sizes: Floats, frequency: Floats, step: float) -> Floats:

@@ -42,7 +42,6 @@ class Jpeg:
     """JPEG as a photo shows it. `quality` None: no comb in its coefficients."""
 
     quality: int | None  # of libjpeg, 1..100
-    evidence: float  # mean gain in log-likelihood per coefficient that is not zero, nats
     blocking: float  # steps across the borders of 8 x 8 blocks over those inside, minus 1
     phase: tuple[int, int]  # row and column of the first block border, 0..7
     # [8, 8] of the luma, steps in 1/255. Of a table that is not libjpeg's only the low frequencies show; the
@@ -61,19 +60,17 @@ def find_jpeg(levels: Floats) -> Jpeg:
     grey = luma(levels)
     blocking, phase = measure_blocking(grey)
     if min(grey.shape) < 3 * 8:  # too few blocks
-        return Jpeg(None, 0.0, blocking, phase, None)
+        return Jpeg(None, blocking, phase, None)
     in_range = np.all((levels > 0) & (levels < 255), axis=2)
-    unproven = []
     # above this a grid that does not begin at the corner is looked at too
     for row, column in dict.fromkeys([(0, 0), phase] if blocking > 0.15 else [(0, 0)]):
         # looked at; they are spread over the photo
         coefficients = block_coefficients(grey[row:, column:], 200, in_range[row:, column:])
-        quality, evidence, table = _best_table(coefficients)
+        quality, table = _best_table(coefficients)
         if quality is not None:
             steps = tuple(tuple(int(step) for step in line) for line in table)
-            return Jpeg(quality, evidence, blocking, (row, column), steps)
-        unproven.append(evidence)
-    return Jpeg(None, max(unproven), blocking, phase, None)
+            return Jpeg(quality, blocking, (row, column), steps)
+    return Jpeg(None, blocking, phase, None)
 
 
 def measure_blocking(grey: Floats) -> tuple[float, tuple[int, int]]:
@@ -92,8 +89,8 @@ def measure_blocking(grey: Floats) -> tuple[float, tuple[int, int]]:
     return min(strengths), (phases[0], phases[1])
 
 
-def _best_table(coefficients: Floats) -> tuple[int | None, float, NDArray[np.int64]]:
-    """Quality (None: not proven), its evidence and table [8, 8] that best explain coefficients [n, 8, 8]."""
+def _best_table(coefficients: Floats) -> tuple[int | None, NDArray[np.int64]]:
+    """Quality (None: not proven) and table [8, 8] that best explain coefficients [n, 8, 8]."""
     scores, count = _comb_scores(coefficients)
     tables = standard_tables()
     totals = _total(scores, tables)
@@ -110,12 +107,10 @@ def _best_table(coefficients: Floats) -> tuple[int | None, float, NDArray[np.int
         free[at] = steps
         candidates.append((quality, free, _total(scores, free[None])[0] - len(steps) * np.log(STEPS)))
     quality, table, total = max(candidates, key=lambda candidate: candidate[2])  # the first of equals
-    evidence = float(total / max(count, 1))
     # in which coefficients must show: few repeat in a drawing
     many = count >= ENOUGH_BLOCKS and (scores != 0).any(axis=1).sum() >= 4
     # nats per coefficient; photos that were never JPEG have -0.25, quality 90 has 0.8
-    proven = many and evidence >= 0.5
-    return (quality if proven else None), evidence, table
+    return (quality if many and total / count >= 0.5 else None), table
 
 
 def _comb_scores(coefficients: Floats) -> tuple[Floats, int]:

@@ -93,14 +93,8 @@ def diagnose_photo(image: Photo, low: Photo | None = None) -> PhotoDiagnosis:
     return conclude([inspect_photo("photo", image, low)])[0]
 
 
-def inspect_photo(
-    name: str,
-    image: Photo,
-    low: Photo | None = None,
-    enlargement: Enlargement | None = None,
-    film: float | None = None,
-) -> Inspected:
-    """The first half of `diagnose_photo`, errors included; `enlargement`, and `View.film`, where known."""
+def inspect_photo(name: str, image: Photo, low: Photo | None = None, film: float | None = None) -> Inspected:
+    """The first half of `diagnose_photo`, errors included; `film`: `View.film`, where known."""
     levels = to_levels(image, f"photo {name!r}")
     height, width = levels.shape[:2]
     if low is not None:
@@ -114,7 +108,7 @@ def inspect_photo(
         fits = (f for f in (near, *range(1, 17)) if (small_side(height, f), small_side(width, f)) == (h, w))
         enlargement = Enlargement(next(fits, near), None, h, w)
     else:
-        enlargement = enlargement or find_enlargement(levels)
+        enlargement = find_enlargement(levels)
         if enlargement.factor > 1:
             levels = undo_enlargement(levels, enlargement.height, enlargement.width)
     levels = _middle(levels)
@@ -170,7 +164,7 @@ def _with_hidden(photo: PhotoDiagnosis, hidden: Hidden | None) -> PhotoDiagnosis
         photo,
         noise=hidden.noise,
         noise_limit=hidden.noise_limit,
-        blur=_enlarged(Blur("gaussian", sigma, sigma, 0.0), scale),
+        blur=_enlarged(Blur("gaussian", sigma, sigma), scale),
         blur_limit=_least_blur(hidden.sigma_limit, photo.enlargement) * scale,
     )
 

@@ -25,11 +25,9 @@ from hqgs.diagnosis.colors import (
 from hqgs.diagnosis.differences import shake_finding
 from hqgs.diagnosis.focus import MOST_PHOTOS, focus_finding
 from hqgs.diagnosis.photo import Finding, Inspected, PhotoDiagnosis, conclude, inspect_photo
-from hqgs.diagnosis.resolution import Enlargement
 from hqgs.photos.formula import KINDS, NONE, parse_formation, within
 from hqgs.scene.scene import Scene, View
 
-PROBES = 4  # photos searched for enlargement; if they agree, the others are taken to be like them
 SCENE_WHITE = 0.2  # up to this correlation of neighbours, noise counts as white
 # JPEG is undone below the first quality, or below the second where blur, noise or an enlargement is undone.
 BAD_QUALITY, VISIBLE_QUALITY = 25, 85
@@ -95,10 +93,10 @@ class Inspector:
             self._known[key] = of, make()
         return self._known[key][1]
 
-    def inspect(self, view: View, enlargement: Enlargement | None = None) -> Inspected:
-        """`inspect_photo` of a view; `enlargement` where it is known."""
-        given = view.name, view.image, view.low, enlargement, view.film
-        return self._once(lambda: inspect_photo(*given), enlargement, [view])
+    def inspect(self, view: View) -> Inspected:
+        """`inspect_photo` of a view."""
+        given = view.name, view.image, view.low, view.film
+        return self._once(lambda: inspect_photo(*given), "photo", [view])
 
     def log_gains(self, scene: Scene) -> NDArray[np.float64] | None:
         """`hqgs.diagnosis.colors.log_gains` of the training photos."""
@@ -122,19 +120,8 @@ class Inspector:
             raise ValueError(f"max_photos is {max_photos}, wanted at least 1")
         chosen = evenly(len(scene.train), max_photos)
         found: list[Inspected] = []
-        taken = 0  # to be like the probes
         for view in (scene.train[k] for k in chosen):
-            probes = [f.diagnosis for f in found[:PROBES] if f.diagnosis.enlargement.evidence is not None]
-            known = None
-            if (
-                len(probes) == PROBES
-                and len({(p.enlargement.factor, p.height, p.width) for p in probes}) == 1
-            ):
-                first = probes[0]
-                if view.image.shape[:2] == (first.height, first.width):
-                    known = first.enlargement
-                    taken += 1
-            found.append(self.inspect(view, known))
+            found.append(self.inspect(view))
             self.on_stage(Stage("photos diagnosed", len(found), len(chosen)))
         photos = self._once(lambda: tuple(conclude(found)), "photos", found)
         own = self._once(lambda: self._own(scene, photos), "own", scene.train)
@@ -150,7 +137,7 @@ class Inspector:
         jpeg = _jpeg(photos, alone=not any(part.needed for part in (*faults, film)))
         parts = (*own, *faults, jpeg, film)
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
-        passed_over = _passed_over(scene.of or len(scene.train), len(photos), taken)
+        passed_over = _passed_over(scene.of or len(scene.train), len(photos))
         self.last = Diagnosis(scene.name, str(parse_formation(text)), parts, photos, passed_over)
         return self.last
 
@@ -174,16 +161,13 @@ def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
     return Inspector().diagnose(scene, max_photos)
 
 
-def _passed_over(total: int, looked_at: int, taken: int) -> tuple[LeftOut, ...]:
-    """What was not looked at of `total` photos; `taken`: those that count as enlarged like the probes."""
+def _passed_over(total: int, looked_at: int) -> tuple[LeftOut, ...]:
+    """What was not looked at of `total` photos."""
     spread = "measured photos are spread over the scene"
     looks = []
     if looked_at < total:
         what = f"{DIAGNOSIS}{total - looked_at} of {total} photos"
         looks.append(LeftOut(what, f"the {looked_at} {spread}"))
-    if taken:
-        what = f"{DIAGNOSIS}enlargement in {taken} of {looked_at} photos"
-        looks.append(LeftOut(what, f"the other {looked_at - taken} photos agree"))
     if total > MOST_PHOTOS:
         what = f"{DIAGNOSIS}focus in {total - MOST_PHOTOS} of {total} photos"
         looks.append(LeftOut(what, f"the {MOST_PHOTOS} {spread}"))

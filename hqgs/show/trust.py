@@ -127,12 +127,10 @@ def trust_of(gaussians: Gaussians, known: RunCameras | None) -> Trust:
     return learn_trust(gaussians, known or RunCameras(np.zeros(3), []))
 
 
-def learn_trust(
-    gaussians: Gaussians, known: RunCameras, photos: int = PHOTOS, held_out: int = CALIBRATORS
-) -> Trust:
+def learn_trust(gaussians: Gaussians, known: RunCameras) -> Trust:
     """What the photos of a run, in its folder, say of its Gaussians.
 
-    The errors are those of at most `photos` training photos, the factor is that of `held_out` others.
+    The errors are those of at most PHOTOS training photos, the factor is that of CALIBRATORS others.
     ValueError where the run has no training photo.
     """
     views = [view for view in known.views if not view.held_out and shows(view)]
@@ -141,7 +139,7 @@ def learn_trust(
     n = len(gaussians)
     sums = torch.zeros(n, 2)  # of weights, and of weights times errors
     with one_torch_thread():
-        looks = [error_of(gaussians, views[k], known.background) for k in evenly(len(views), photos)]
+        looks = [error_of(gaussians, views[k], known.background) for k in evenly(len(views), PHOTOS)]
         for off in looks:
             pixels = torch.stack([off.counts.float(), off.error], -1)
             sums += _back(gaussians, off.camera, torch.zeros(n, 2), pixels)
@@ -153,7 +151,7 @@ def learn_trust(
                 found += _back(gaussians, off.camera, errors[:, None], off.error[..., None], off.counts)[:, 0]
             errors = (errors * found + PRIOR) / weights
     out, held = [view for view in known.views if view.held_out and shows(view)], list[Held]()
-    for view in (out[k] for k in evenly(len(out), held_out)):
+    for view in (out[k] for k in evenly(len(out), CALIBRATORS)):
         off = error_of(gaussians, view, known.background)
         if off.counts.any():
             seen = blended(gaussians, off.camera, errors)

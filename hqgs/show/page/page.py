@@ -26,13 +26,10 @@ from hqgs.evaluation.records import HistoryEntry, Json, PlanRowRecord, Report, V
 from hqgs.evaluation.verdict import judged_by, told, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
-from hqgs.scene.camera_files import load_cameras
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
-from hqgs.show.frames import trust_picture
 from hqgs.show.page.charts import TEMPLATES, filled, line_chart, places_chart
 from hqgs.show.page.packing import pack_scene
-from hqgs.show.trust import ROUNDS, learn_trust, measure_trust
 
 PAIR_SIDE = 720  # px, of a picture
 SCRIPTS = ("splat_shaders.js", "splats.js")
@@ -53,7 +50,6 @@ class Page:
     gaussians: Gaussians | None
     views: Sequence[RenderedView] = field(repr=False)
     diagnosis: Diagnosis | None = None
-    folder: Path | None = None  # of the run, which has written its cameras and photos
 
 
 def told_verdict(report: Report) -> str:
@@ -102,9 +98,7 @@ def page_text(page: Page) -> str:
     ]
     measured_some = [h["views"] for h in history if "views" in h]
     learned = [learned_words(record) for record in report["learned"]]
-    diagnosis, trust = page.diagnosis, None
-    if page.folder is not None and page.gaussians is not None and len(page.gaussians):
-        trust = trust_part(page.folder, page.gaussians, report["iterations"])
+    diagnosis = page.diagnosis
     return filled(
         "report.html.j2",
         title=f"{report['scene']}, {report['method']}",
@@ -132,42 +126,11 @@ def page_text(page: Page) -> str:
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],
         places=places_chart(page.scene),
-        trust=trust,
-        trust_pictures=[] if trust is None else [(what, jpeg(picture)) for what, picture in trust.pictures],
         sure=_sure(report),
         lost=[*((report.get("sfm") or {}).get("lost") or {}).items()],
         environment=_environment(report),
         config=json.dumps(report["config"], indent=1),
     )
-
-
-@dataclass(frozen=True)
-class TrustPart:
-    """How far renders of other places can be believed, and pictures of the held-out photo shown worst."""
-
-    line: str
-    name: str = ""
-    pictures: tuple[tuple[str, Image.Image], ...] = ()  # what they are, and they
-
-
-def trust_part(folder: Path, gaussians: Gaussians, iterations: int) -> TrustPart:
-    """Of a run that has written its cameras and photos into a folder.
-
-    As many photos are looked at as take about 6 % of the views that its steps took.
-    """
-    photos = min(max(round(0.06 * iterations / (ROUNDS + 1)), 4), 64)
-    trust = learn_trust(gaussians, load_cameras(folder), photos, held_out=photos)
-    measured = measure_trust(trust)
-    if measured is None:
-        why = "No photo was held out, so the errors of new views are unknown."
-        return TrustPart(why)
-    by = "The bound of each photo is calibrated on the others" if measured.photos > 1 else "Not calibrated"
-    one = max(trust.held, key=lambda held: held.flat(held.error).mean())
-    render = to_uint8(gaussians.render(one.camera).detach().numpy())
-    maps = {"render": render, "trust": trust_picture(trust.bound(one.camera))}
-    maps["error"] = trust_picture(255 * one.error)
-    pictures = tuple((what, Image.fromarray(shown)) for what, shown in maps.items())
-    return TrustPart(f"Trust: {measured}. {by}.", one.name, pictures)
 
 
 def _sure(report: Report) -> list[tuple[str, str]]:
