@@ -63,11 +63,8 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
 
 
 def publish(out: Path, results: Path) -> None:
-    """Put the lines of `out` in the place of those of the pages' tables; rows of other programs stay.
-
-    What no page reads, the runs at their moments, stays in `out`.
-    """
-    for name in KEYS.keys() - {"moments"}:
+    """Put the lines of `out` in the place of those of the pages' tables; rows of other programs stay."""
+    for name in KEYS:
         lines = Table(out / f"{name}.csv").rows()
         if lines:
             table = Table(results / f"{name}.csv")

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hqgs.base.machine import peak_rss_mb
-from hqgs.evaluation.held_out import HeldOutViews, held_out_means
-from hqgs.evaluation.metrics import haarpsi, psnr, ssim
+from hqgs.evaluation.held_out import HeldOutViews
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.forward import Step
@@ -19,7 +18,6 @@ from hqgs.training.frame import Frame
 from hqgs.training.trainer import Trainer, fit_to_seconds
 
 Run = dict[str, Any]  # plain JSON values
-MEASURED = {"psnr": psnr, "ssim": ssim, "haarpsi": haarpsi}  # at the moments of a run
 
 
 def reset_peak_rss() -> bool:
@@ -43,7 +41,6 @@ class Training:
         self.setup_seconds = time.perf_counter() - started
         self.setup_cpu_seconds = time.process_time() - clock
         self.initial_points = len(self.trainer.gaussians)
-        self.moments = list[Run]()  # held-out means on the way, where they were asked for
         self.cpu_seconds = 0.0  # of all threads in the steps; tells a busy machine from a slow method
 
     def steps(self, count: float = math.inf, after: Callable[[Step], None] = lambda step: None) -> None:
@@ -81,23 +78,14 @@ class Training:
         last = self.trainer.history[-1]
         return {"psnr": last["psnr"], "ssim": last["ssim"]} | self.record()
 
-    def look(self) -> None:
-        """Measure all held-out views here, once, by all that the views' table has. Takes no training time."""
-        trainer = self.trainer
-        if not self.moments or self.moments[-1]["moment"] != trainer.iteration:
-            means = held_out_means(list(MEASURED.values()), self.held_out())
-            named = dict(zip(MEASURED, means, strict=True))
-            self.moments.append({"moment": trainer.iteration, "seconds": trainer.seconds} | named)
-
     def history(self) -> dict[str, float]:
         """Held-out PSNR by seconds of training."""
         known = [entry for entry in self.trainer.history if entry["psnr"] is not None]
         return {f"{entry['seconds']:.5g}": float(f"{entry['psnr']:.5g}") for entry in known}
 
 
-def train(photos: Scene, config: TrainConfig, evaluate: bool = True, moments: int = 0) -> Training:
-    """Train to the end. With `evaluate` the held-out views are measured as the configuration asks and there;
-    `moments`: so many times, evenly spread, all of them by all metrics (`Training.look`).
+def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training:
+    """Train to the end. With `evaluate` the held-out views are measured as the configuration asks and there.
 
     Raises ValueError as `Trainer` does, and TrainingError.
     """
@@ -108,12 +96,8 @@ def train(photos: Scene, config: TrainConfig, evaluate: bool = True, moments: in
     def after(_: Step) -> None:
         if evaluate and trainer.iteration % trainer.config.eval_every == 0:
             trainer.evaluate()
-        if moments and trainer.iteration * moments // trainer.length > len(done.moments):
-            done.look()
 
     done.steps(after=after)
     if evaluate:
         trainer.evaluate()
-    if moments:
-        done.look()
     return done

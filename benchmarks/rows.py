@@ -27,7 +27,6 @@ Row = Mapping[str, Any]
 RUN = ("scene", "degradation", "row", "seed", "iterations", "downscale", "poses")  # the key of a training run
 KEYS: dict[str, Sequence[str]] = {  # of each table's lines
     **dict.fromkeys(("quality", "time", "endurance", "parts"), RUN),
-    "moments": (*RUN, "moment"),
     "poses": ("scene", "degradation", "seed", "downscale"),
     "export": ("scene", "file"),
     "accuracy": ("inputs", "knob", "value"),

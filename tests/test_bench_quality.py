@@ -378,19 +378,3 @@ def test_bad_options_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str
     (tmp_path / "degradation.json").write_text("{}", encoding="utf-8")
     with pytest.raises(ValueError, match="holds degraded photos"):
         load_scenes([tmp_path], tiny, tmp_path, False)
-
-
-def test_a_run_is_measured_at_its_moments_too(tmp_path: Path) -> None:
-    protocol = narrowed(PROTOCOLS["quick"], rows=["3dgs"], degradations=["none"], seeds=[0], iterations=10)
-    bench = bench_of(tmp_path, replace(protocol, moments=4), [tiny_scene()])
-    (run,) = bench.study.frame().to_dict("records")
-    lines = Table(tmp_path / "moments.csv").frame().to_dict("records")
-    assert [line["moment"] for line in lines] == [3, 5, 8, 10]
-    for name in ("psnr", "ssim", "haarpsi"):
-        assert lines[-1][name] == pytest.approx(run[name], abs=1e-6)
-        assert run[f"best_{name}"] == pytest.approx(max(line[name] for line in lines))
-    assert run["fall"] == pytest.approx(run["best_psnr"] - run["psnr"], abs=1e-5)
-    (table, *_) = [text for text in bench.tables() if "best PSNR" in text]
-    assert f"{run['best_haarpsi']:.3f}" in table
-    with pytest.raises(ValueError, match="moments is -1"):
-        narrowed(protocol, moments=-1)

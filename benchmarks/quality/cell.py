@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.measure import MEASURED, Run, train
+from benchmarks.measure import Run, train
 from benchmarks.protocol import degraded_view
 from benchmarks.quality.deblur import train_deblur
 from benchmarks.study import Cell
@@ -37,35 +37,22 @@ RENDERS = 3  # times that each held-out view is rendered
 METRICS = ("psnr", "ssim", "haarpsi", "psnr_aligned")  # that the table has
 
 
-def run_cell(
-    cell: Cell,
-    photos: Scene,
-    pictures: list[Path],
-    fit: bool = False,
-    moments: int = 0,
-    keep: Callable[[Sequence[Run]], object] = lambda lines: None,
-) -> Run:
+def run_cell(cell: Cell, photos: Scene, pictures: list[Path], fit: bool = False) -> Run:
     """Train and measure one cell; the columns of its line. Its first held-out views become `pictures`.
 
     `photos` is what is trained; with `fit` the held-out views are measured a second time, each from the
-    camera from which the trained scene fits its photo best. Of so many `moments` of the run there are the
-    best too, and `keep` gets a line of each.
+    camera from which the trained scene fits its photo best.
     Raises ValueError as `Trainer` does, and TrainingError.
     """
     rival = bool(cell.more.get("rival"))
-    done = train_deblur(photos, cell.config) if rival else train(photos, cell.config, moments=moments)
+    done = train_deblur(photos, cell.config) if rival else train(photos, cell.config)
     views = list(done.held_out())
     mean = asdict(mean_metrics([evaluate_view(view.render, view.photo, view.mask) for view in views]))
     for view, path in zip(views, pictures, strict=False):
         with atomic_path(path) as tmp:
             Image.fromarray(to_uint8(view.render)).save(tmp)
     facts = _facts(done.trainer, cell) | (_fitted(done.trainer) if fit else {})
-    if done.moments:
-        keep(done.moments)
-        facts |= {f"best_{name}": best_of(done.moments, name) for name in MEASURED}
-    best = facts.get("best_psnr")
-    fell = {"fall": best - mean["psnr"] if best else fall(done.trainer.history)}
-    run = {name: mean[name] for name in METRICS} | fell
+    run = {name: mean[name] for name in METRICS} | {"fall": fall(done.trainer.history)}
     return run | done.record() | facts | {"peak_mb": done.peak_rss_mb()}
 
 
@@ -74,12 +61,6 @@ def fall(history: Sequence[Mapping[str, Any]]) -> float | None:
     last = history[-1]
     values = [entry["psnr"] for entry in history if entry.get("views") == last.get("views")]
     return None if None in values else max(values) - last["psnr"]
-
-
-def best_of(moments: Sequence[Run], name: str) -> float | None:
-    """The best mean of a metric at any moment of a run; None where it has no value."""
-    values = [moment[name] for moment in moments]
-    return None if None in values else max(values)
 
 
 def reconstruction(report: SfmReport) -> Run:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.command import Benchmark
-from benchmarks.measure import Run
 from benchmarks.pages.figures import crossed, gains
 from benchmarks.protocol import read_protocols
 from benchmarks.quality.cell import reconstruction, run_cell, write_contacts, write_sheet
@@ -19,15 +17,7 @@ from hqgs.scene.scene import Scene
 
 PROTOCOLS = read_protocols(Path(__file__).parent / "protocols.toml", RivalRow)
 ALSO = {"ssim": ("SSIM", ".3f"), "fall": ("below its best (dB)", ".2f")}
-BEST = {
-    f"best_{name}": (f"best {head}", form)
-    for name, (head, form) in (
-        ("psnr", ("PSNR", ".2f")),
-        ("ssim", ("SSIM", ".3f")),
-        ("haarpsi", ("HaarPSI", ".3f")),
-    )
-}
-POSES, MOMENTS = "poses.csv", "moments.csv"  # tables of what `--sfm` found, and of runs at their moments
+POSES = "poses.csv"  # what `--sfm` found
 
 
 class Quality:
@@ -39,13 +29,8 @@ class Quality:
     def measure(self, cell: Cell, photos: Scene) -> dict[str, Any]:
         keeps = cell.seed == self.protocol.seeds[0]
         pictures = [self.render(cell, number) for number in range(self.args.pictures if keeps else 0)]
-        moments = Table(self.args.out / MOMENTS)
-
-        def keep(lines: Sequence[Run]) -> None:
-            moments.put([cell.key | line | facts() for line in lines])
-
         fit = self.args.sfm or self.args.fit_cameras
-        run = run_cell(cell, photos, pictures, fit, self.protocol.moments, keep)
+        run = run_cell(cell, photos, pictures, fit)
         self.note(cell, photos)
         return run
 
@@ -106,9 +91,8 @@ class Quality:
         seeds = ", ".join(map(str, protocol.seeds))
         held = "VALIDATION views (held-out training photos)" if self.args.validate else "held-out views"
         what = f"PSNR (dB) of {held}: {protocol.iterations:,} iterations, photos at 1/{protocol.downscale:g}"
-        also = ALSO | {"haarpsi": ("HaarPSI", ".3f")} | BEST if protocol.moments else ALSO
-        across = "scene" if protocol.moments else "degradation"
-        found = [f"{what}, seeds {seeds}", crossed(runs, also=also, across=across)]
+        across = "scene" if len(self.study.scenes) > len(protocol.degradations) else "degradation"
+        found = [f"{what}, seeds {seeds}", crossed(runs, also=ALSO, across=across)]
         if "psnr_fitted" in runs:
             found += ["The same with held-out cameras fitted to the scene", crossed(runs, "psnr_fitted")]
         others = [label for label in protocol.labels if label != protocol.baseline]
