@@ -107,31 +107,13 @@ def rasterization(
             rolling shutter, distributed rendering, gradients of Ks, absgrad of a batch).
     """
     refuse({"distributed": distributed, "camera_model": camera_model, **unsupported})
-    colors, rest = colors if isinstance(colors, tuple | list) and len(colors) == 2 else (colors, None)
-    for name, value in (("means", means), ("viewmats", viewmats)):
-        if not isinstance(value, Tensor):
-            raise ValueError(f"{name}: expected a torch tensor, got {short(value)}")
     if covars is not None and activate:
         raise ValueError("activate: not with covars, which are no logarithms")
-    if covars is not None:
-        quats, scales = quats_and_scales(covars, means)
-    tensors: dict[str, Any] = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-    tensors["colors"] = colors
-    if rest is not None:
-        tensors["colors[1]"] = rest
-    if covars is not None:
-        tensors["covars"] = covars
-    batch = batch_of({**tensors, "viewmats": viewmats, "Ks": Ks})
-    if backgrounds is not None:
-        c = viewmats.shape[len(batch)] if viewmats.dim() > len(batch) else 0
-        tensors["backgrounds"] = as_backgrounds(backgrounds, means, batch, c)
-        batch_of(tensors)
+    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+    given |= {"covars": covars, "backgrounds": backgrounds, "viewmats": viewmats, "Ks": Ks}
+    scenes, batch = _scenes(given, sh_degree)
     if batch and absgrad:
         raise NotImplementedError("absgrad: not with leading batch dimensions; call hqgs for each scene")
-    scenes = _each_scene({**tensors, "viewmats": viewmats, "Ks": Ks}, len(batch))
-    one = scenes[0]
-    check_tensors({name: one[name] for name in tensors}, one["viewmats"], one["Ks"])
-    n, c = one["means"].shape[0], one["viewmats"].shape[0]
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode: must be one of {RENDER_MODES}, got {render_mode!r}")
     if rasterize_mode not in RASTERIZE_MODES:
@@ -140,10 +122,51 @@ def rasterization(
     check_numbers(width, height, tile_size, at_least_0)
     if not far_plane > near_plane:
         raise ValueError(f"far_plane: must be larger than near_plane {near_plane!r}, got {far_plane!r}")
-    check_colors(one["colors"], one.get("colors[1]"), n, c, sh_degree)
-
     numbers = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
     config = (int(width), int(height), (*numbers, rasterize_mode == "antialiased"), activate, sh_degree)
+    images, alphas, meta = _rendered(scenes, batch, config, packed, render_mode, absgrad)
+    size = {"width": int(width), "height": int(height), "tile_size": tile_size}
+    size |= {"tile_width": -(-int(width) // tile_size), "tile_height": -(-int(height) // tile_size)}
+    return images, alphas, cast(RasterizationMeta, Meta(meta | size))
+
+
+def _scenes(given: dict[str, Any], sh_degree: int | None) -> tuple[list[dict[str, Tensor]], tuple[int, ...]]:
+    """The tensors of each scene of a batch, checked, and the batch's dimensions."""
+    colors = given["colors"]
+    pair = isinstance(colors, tuple | list) and len(colors) == 2
+    given["colors"], rest = colors if pair else (colors, None)
+    means, viewmats = given["means"], given["viewmats"]
+    for name, value in (("means", means), ("viewmats", viewmats)):
+        if not isinstance(value, Tensor):
+            raise ValueError(f"{name}: expected a torch tensor, got {short(value)}")
+    if given["covars"] is not None:
+        given["quats"], given["scales"] = quats_and_scales(given["covars"], means)
+    names = ["means", "quats", "scales", "opacities", "colors"]
+    tensors: dict[str, Any] = {name: given[name] for name in names}
+    tensors |= {"colors[1]": rest} if rest is not None else {}
+    tensors |= {"covars": given["covars"]} if given["covars"] is not None else {}
+    cameras = {"viewmats": viewmats, "Ks": given["Ks"]}
+    batch = batch_of(tensors | cameras)
+    if given["backgrounds"] is not None:
+        c = viewmats.shape[len(batch)] if viewmats.dim() > len(batch) else 0
+        tensors["backgrounds"] = as_backgrounds(given["backgrounds"], means, batch, c)
+        batch_of(tensors)
+    scenes = _each_scene(tensors | cameras, len(batch))
+    one = scenes[0]
+    check_tensors({name: one[name] for name in tensors}, one["viewmats"], one["Ks"])
+    check_colors(one["colors"], one.get("colors[1]"), len(one["means"]), len(one["viewmats"]), sh_degree)
+    return scenes, batch
+
+
+def _rendered(
+    scenes: list[dict[str, Tensor]],
+    batch: tuple[int, ...],
+    config: tuple[Any, ...],
+    packed: bool,
+    render_mode: str,
+    absgrad: bool,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Images, alphas and what the meta data hold of the splats."""
     projected = [_project(scene, config) for scene in scenes]
     pairs = Pairs([splats["radii"] for splats in projected]) if packed else None
     parts: Sequence[Tensor | None] = [None] * len(scenes)
@@ -166,32 +189,18 @@ def rasterization(
         if absgrad:  # it is left in there
             pairs.shown(positions, *dense)
     shots = zip(scenes, projected, dense, parts, strict=True)
-    images, alphas, works = zip(
-        *(
-            _composite(*shot, pairs and OfScene(pairs, k), render_mode, absgrad)
-            for k, shot in enumerate(shots)
-        ),
-        strict=True,
+    rendered = (
+        _composite(*shot, pairs and OfScene(pairs, k), render_mode, absgrad) for k, shot in enumerate(shots)
     )
-    meta = {
-        "means2d": means2d,
-        "radii": of_splats("radii"),
-        "depths": of_splats("depths"),
-        "conics": of_splats("conics"),
-        "opacities": of_splats("opacities"),
-        "batch_ids": pairs and Later(pairs.ids, 0),
-        "camera_ids": pairs and Later(pairs.ids, 1),
-        "gaussian_ids": pairs and Later(pairs.ids, 2),
-        "width": int(width),
-        "height": int(height),
-        "tile_size": tile_size,
-        "tile_width": -(-int(width) // tile_size),
-        "tile_height": -(-int(height) // tile_size),
-        "n_batches": len(scenes),
-        "n_cameras": c,
-        "work": (sum(w[0] for w in works), sum(w[1] for w in works), sum(w[2] for w in works)),
+    images, alphas, works = zip(*rendered, strict=True)
+    meta = {"means2d": means2d} | {
+        name: of_splats(name) for name in ("radii", "depths", "conics", "opacities")
     }
-    return together(images), together(alphas), cast(RasterizationMeta, Meta(meta))
+    for k, name in enumerate(("batch_ids", "camera_ids", "gaussian_ids")):
+        meta[name] = pairs and Later(pairs.ids, k)
+    meta |= {"n_batches": len(scenes), "n_cameras": len(scenes[0]["viewmats"])}
+    meta["work"] = tuple(sum(work[k] for work in works) for k in range(3))
+    return together(images), together(alphas), meta
 
 
 def _each_scene(tensors: dict[str, Tensor], dims: int) -> list[dict[str, Tensor]]:

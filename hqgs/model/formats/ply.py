@@ -106,32 +106,22 @@ def read_ply(path: Path) -> Arrays:
     ValueError: not a PLY file, not this layout, more rows promised than the file can hold, or no row that is
     finite. The message names the property.
     """
-    header = header_of(path)
+    header, vertices = header_of(path), read_vertices(path)
     told = told_by(header.comments)
     notes, world = told.pop("notes"), told.get("world", World())
-    vertices = read_vertices(path)
     present = {name for name in vertices.dtype.names or () if vertices.dtype[name].kind in "fiu"}
     rest = [f"f_rest_{i}" for i in range(sum(name.startswith("f_rest_") for name in present))]
     discs = _SCALES[2] not in present and {*_SCALES[:2]} <= present
     colored = {*_COLORS} <= present and not {*_DC} & present
     _check_columns(present, [*([] if colored else _DC), *rest, "opacity", *_SCALES[: 2 if discs else 3]])
-
-    def columns(names: list[str], kind: type = np.float32) -> NDArray[Any]:
-        found = np.empty((len(vertices), len(names)), kind)
-        for k, name in enumerate(names):
-            with np.errstate(over="ignore"):  # of float64
-                found[:, k] = vertices[name]
-        return found
-
     wide = any(vertices.dtype[name].itemsize > 4 for name in _MEANS)
-    means = columns(_MEANS, np.float64) if wide or not world.ordinary else columns(_MEANS)
-    opacities, scales = columns(["opacity"])[:, 0], columns(_SCALES[:2] if discs else _SCALES)
-    if _are_shares(opacities) and not any(line.startswith(OURS) for line in header.comments):
-        opacities = to_logits(opacities, SHARE_STEP)
-        notes.append("its opacities lie between 0 and 1: they were read as shares, not as logits")
-        if (scales > 0).all():
-            scales = np.log(scales)
-            notes.append("none of its scales is below 0: they were read as lengths, not as logarithms")
+    means = _columns(vertices, _MEANS, np.float64 if wide or not world.ordinary else np.float32)
+    opacities, scales = (
+        _columns(vertices, ["opacity"])[:, 0],
+        _columns(vertices, _SCALES[: 2 if discs else 3]),
+    )
+    if not any(line.startswith(OURS) for line in header.comments):
+        opacities, scales = _as_stored(opacities, scales, notes)
     if discs:
         flat = np.float32(math.log(1e-3))
         scales = np.append(scales, scales.min(1, keepdims=True) + flat, axis=1)
@@ -145,32 +135,60 @@ def read_ply(path: Path) -> Arrays:
     clamped = int(np.isinf(opacities).sum()), int((scales == -np.inf).any(1).sum())
     opacities = np.where(np.isinf(opacities), np.copysign(np.float32(MOST_LOGIT), opacities), opacities)
     scales = np.where(scales == -np.inf, np.float32(math.log(1e-20)), scales)
-    higher = columns(rest).reshape(len(vertices), 3, len(rest) // 3).transpose(0, 2, 1)
+    higher = _columns(vertices, rest).reshape(len(vertices), 3, len(rest) // 3).transpose(0, 2, 1)
     if len(rest) == _REST_4:
         notes.append("its harmonics of degree 4 were left out")
         higher = higher[:, : _REST_COUNTS[-1] // 3]
     arrays: Arrays = {
         "means": means.astype(np.float32),
         "scales": scales,
-        "quats": columns(_QUATS),
+        "quats": _columns(vertices, _QUATS),
         "opacities": opacities,
-        "sh0": _plain_colors(vertices) if colored else columns(_DC)[:, None, :],
+        "sh0": _plain_colors(vertices) if colored else _columns(vertices, _DC)[:, None, :],
         "shN": higher,
     }
     if _ERROR in present:
-        arrays["errors"] = sound_errors(columns([_ERROR])[:, 0])
-    keep = whole_rows(arrays)
-    if not keep.all():
-        if not keep.any():
-            raise ValueError(f"none of its {len(keep)} rows is finite, the first is {vertices[0]!s:.200}")
-        notes.append(f"{int((~keep).sum())} of {len(keep)} Gaussians hold NaN or Inf and were left out")
-        arrays = pick(arrays, keep)
+        arrays["errors"] = sound_errors(_columns(vertices, [_ERROR])[:, 0])
+    arrays = _whole(arrays, vertices, notes)
     for count, what in zip(clamped, ("infinite opacities", "scales of 0"), strict=True):
         if count:
             notes.append(f"{count} {what} became the nearest that there is")
     if more := bytes_after(path, header):
         notes.append(f"{more} bytes after its last row were passed by")
     return {**arrays, **told, "world": world, "notes": notes}
+
+
+def _columns(vertices: NDArray[Any], names: list[str], kind: type = np.float32) -> NDArray[Any]:
+    """[N, len(names)]."""
+    found = np.empty((len(vertices), len(names)), kind)
+    for k, name in enumerate(names):
+        with np.errstate(over="ignore"):  # of float64
+            found[:, k] = vertices[name]
+    return found
+
+
+def _as_stored(
+    opacities: NDArray[Any], scales: NDArray[Any], notes: list[str]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Logits and logarithms, of values of another program that may be neither; `notes` tell."""
+    if not _are_shares(opacities):
+        return opacities, scales
+    notes.append("its opacities lie between 0 and 1: they were read as shares, not as logits")
+    if (scales > 0).all():
+        scales = np.log(scales)
+        notes.append("none of its scales is below 0: they were read as lengths, not as logarithms")
+    return to_logits(opacities, SHARE_STEP), scales
+
+
+def _whole(arrays: Arrays, vertices: NDArray[Any], notes: list[str]) -> Arrays:
+    """Those that are finite; ValueError where none is."""
+    keep = whole_rows(arrays)
+    if keep.all():
+        return arrays
+    if not keep.any():
+        raise ValueError(f"none of its {len(keep)} rows is finite, the first is {vertices[0]!s:.200}")
+    notes.append(f"{int((~keep).sum())} of {len(keep)} Gaussians hold NaN or Inf and were left out")
+    return pick(arrays, keep)
 
 
 def _check_columns(present: set[str], wanted: list[str]) -> None:
