@@ -9,7 +9,7 @@ from test_learned_cameras import textured_scene
 
 import hqgs
 from hqgs.model.consistency import Agreement
-from hqgs.model.first_points import points_along_edges, points_found_back
+from hqgs.model.first_points import points_along_edges
 from hqgs.scene.scene import View
 
 SCENE = textured_scene(8, 96)  # a plane at depth 1
@@ -18,7 +18,7 @@ SCENE = textured_scene(8, 96)  # a plane at depth 1
 def found(views: list[View], count: int = 800) -> tuple[np.ndarray, np.ndarray, float]:
     assert SCENE.seen is not None
     agreement = Agreement(views, SCENE.seen)
-    return points_found_back(views, SCENE.points, SCENE.seen, count, 0, agreement)
+    return points_along_edges(views, SCENE.points, SCENE.seen, count, 0, agreement, found_back=True)
 
 
 def off_the_plane(points: np.ndarray) -> np.ndarray:
@@ -72,10 +72,14 @@ def test_photos_from_one_place_tell_no_depth() -> None:
     for most in (4, 8):
         assert 3 not in {k // 3 for k in agreement.asked(9, most)}
     assert len({k // 3 for k in agreement.asked(9)}) == 4
-    points, _, _ = points_found_back(views, SCENE.points, seen, 1600, 0, agreement)
+    points, _, _ = points_along_edges(views, SCENE.points, seen, 1600, 0, agreement, found_back=True)
     assert len(points) > 1000
     assert np.mean(off_the_plane(points) < 0.02) > 0.97  # 0.56 where copies are asked
 
     still = {str(k): seen[views[0].name] for k in range(6)}
     one_place = [replace(views[0], name=name) for name in still]
-    assert not len(points_found_back(one_place, SCENE.points, still, 800, 0, Agreement(one_place, still))[0])
+    assert not len(
+        points_along_edges(
+            one_place, SCENE.points, still, 800, 0, Agreement(one_place, still), found_back=True
+        )[0]
+    )

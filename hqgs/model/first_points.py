@@ -1,8 +1,8 @@
 """More points to start from, between those of the reconstruction: pixels at depths on which photos agree.
 
-`points_along_edges` takes what two other photos agree on. `points_found_back`, for few photos, seeks twice:
-what is found at first, and found back by other photos, tells more closely where to look; so does it where no
-two others agree, and one alone must. Numbers were chosen on held-back photos.
+Taken is what two other photos agree on. Of few photos it is sought twice: what is found at first, and found
+back by other photos, tells more closely where to look; so does it where no two others agree, and one alone
+must. Numbers were chosen on held-back photos.
 """
 
 from __future__ import annotations
@@ -43,9 +43,10 @@ def points_along_edges(
     seed: int,
     agreement: Agreement,
     on_stage: OnStage = silent,
+    found_back: bool = False,
 ) -> tuple[Points, Colors, float]:
     """About `count` points [M, 3] (world) under pixels of the photos, and those pixels' colours [M, 3];
-    and the share of so many that it found.
+    and the share of a first look at so many pixels at which photos agree.
 
     Each view gets an equal share. Pixels are drawn without repetition, most of them in proportion to the
     photo's edges. Their depths are sought around those of the nearest points that the view sees, where other
@@ -60,39 +61,20 @@ def points_along_edges(
         agreement: of the same views: how they are looked at; it tells the depths, and points that it does
             not find are left out.
         on_stage: hears of each view.
+        found_back: look a second time, around what two others find back of the first look. A pixel counts
+            where two others agree and one of them finds it back, or where one alone agrees much and finds it
+            back: at the depth that it has there, within a pixel.
     """
     surfaces, each = Surfaces(views, points, seen), shares(count, len(views))
-    found = list[Found]()
-    for one in _of_each(lambda k: first_look(surfaces, k, each[k], seed, agreement), len(views)):
-        found.append(one)
-        on_stage(Stage(STAGE, len(found), len(views)))
-    agreeing = sum(len(depths) for _, _, depths in found)
-    return *gathered(views, found), agreeing / max(count, 1)
-
-
-def points_found_back(
-    views: Sequence[View],
-    points: Points,
-    seen: Mapping[str, NDArray[np.intp]],
-    count: int,
-    seed: int,
-    agreement: Agreement,
-    on_stage: OnStage = silent,
-) -> tuple[Points, Colors, float]:
-    """At most `count` points, as `points_along_edges` has them, and the share of a first look at so many
-    pixels at which photos agree.
-
-    A pixel counts where two others agree and one of them finds it back, or where one alone agrees much and
-    finds it back: at the depth that it has there, within a pixel.
-    """
-    surfaces = Surfaces(views, points, seen)
-    each, looks, found = shares(count, len(views)), 2 * len(views), list[Found]()
+    looks, agreeing, found = (1 + found_back) * len(views), 0, list[Found]()
 
     def first(number: int) -> tuple[int, Found]:
         _, pixels, depths = first_look(surfaces, number, each[number], seed, agreement)
-        asked = agreement.asked(number)
-        by_two = _found_back(agreement, surfaces, number, pixels, depths, asked, 2)
-        return len(depths), (number, pixels[by_two], depths[by_two])
+        kept = np.ones(len(depths), bool)
+        if found_back:
+            asked = agreement.asked(number)
+            kept = _found_back(agreement, surfaces, number, pixels, depths, asked, 2)
+        return len(depths), (number, pixels[kept], depths[kept])
 
     def second(number: int) -> Found:
         if not each[number] or not surfaces.known(number):
@@ -102,16 +84,17 @@ def points_found_back(
         depths, kept = _borne_out(agreement, surfaces, number, pixels)
         return number, pixels[kept], depths[kept]
 
-    agreeing, sure = 0, list[Found]()
     for agreed, one in _of_each(first, len(views)):
         agreeing += agreed
-        sure.append(one)
-        on_stage(Stage(STAGE, len(sure), looks))
-    for one in sure:
-        surfaces.add(*one)
-    for one in _of_each(second, len(views)):
         found.append(one)
-        on_stage(Stage(STAGE, len(views) + len(found), looks))
+        on_stage(Stage(STAGE, len(found), looks))
+    if found_back:
+        for one in found:
+            surfaces.add(*one)
+        found = list[Found]()
+        for one in _of_each(second, len(views)):
+            found.append(one)
+            on_stage(Stage(STAGE, len(views) + len(found), looks))
     return *gathered(views, found), agreeing / max(count, 1)
 
 

@@ -12,7 +12,7 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
 from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.model.consistency import Agreement
-from hqgs.model.first_points import Colors, Points, points_along_edges, points_found_back
+from hqgs.model.first_points import Colors, Points, points_along_edges
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.shapes import as_discs
 from hqgs.scene.scene import Scene
@@ -122,10 +122,8 @@ class Prepared:
             return points, colors, 1.0
         if (key := (wanted, found_back)) not in self._points:
             agreement = Agreement(scene.train, scene.seen)
-            search = points_found_back if found_back else points_along_edges
-            count, seed = wanted - len(points), self.asked.seed
-            found = search(scene.train, points, scene.seen, count, seed, agreement, self._on_stage)
-            more, their_colors, agreed = found
+            given = points, scene.seen, wanted - len(points), self.asked.seed, agreement, self._on_stage
+            more, their_colors, agreed = points_along_edges(scene.train, *given, found_back)
             both = np.concatenate([points, more]), np.concatenate([colors, their_colors])
             self._points[key] = *both, agreed
         return self._points[key]
