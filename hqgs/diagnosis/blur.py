@@ -53,21 +53,6 @@ class Spectrum:
         return along[:, None], along[None]
 
 
-@dataclass(frozen=True)
-class Fit:
-    """How well each of several blurs explains a spectrum."""
-
-    costs: Floats  # [blurs]: weighted squares of the log power's misfit and of the slope's oddness
-
-    @property
-    def best(self) -> int:
-        return int(self.costs.argmin())
-
-    @property
-    def cost(self) -> float:
-        return float(self.costs.min())
-
-
 def tile_size(grey: Floats) -> int | None:
     """Side of the tiles for a luma [H, W]; None for a photo too small for any."""
     short = min(grey.shape)
@@ -114,8 +99,10 @@ def fit_blurs(
     log_blurs: Floats,
     noise: float,
     steps: int = 8,  # of the fit of the law
-) -> Fit:
+) -> Floats:
     """Fit `log(exp(c) frequency^-a blur + noise)` to `log_power` for each blur; [points], blurs [B, points].
+
+    Returns what each costs, [B]: weighted squares of the log power's misfit and of the slope's oddness.
 
     `error`: standard deviation of the log power. `log_blurs` are log power responses, `noise` the power of
     what was not blurred. Amplitude c is free, slope a is held near its usual value (SPECTRUM_SLOPE): so a
@@ -143,7 +130,7 @@ def fit_blurs(
         height += ((h22 * g1 - h12 * g2) / determinant).clip(-3, 3)
         slope += ((h11 * g2 - h12 * g1) / determinant).clip(-0.7, 0.7)
     misfit = log_power - predict()[1]
-    return Fit((weight * misfit**2).sum(1) + stiffness * (slope - SPECTRUM_SLOPE) ** 2)
+    return (weight * misfit**2).sum(1) + stiffness * (slope - SPECTRUM_SLOPE) ** 2
 
 
 def _starts(size: int, tile: int) -> NDArray[np.int64]:
@@ -188,12 +175,12 @@ def estimate_blur(levels: Floats, noise: float) -> Blur | None:
         (*(fit_blurs(frequency, log_power, RING_ERROR, blur, floor) for blur in blurs), floor)
         for floor in known + np.array(UNKNOWN_FLOORS)
     ]
-    gaussian, defocus, floor = min(fits, key=lambda fit: min(fit[0].cost, fit[1].cost))
-    sigma, radius = float(BLUR_SIGMAS[gaussian.best]), float(RADII[defocus.best])
+    gaussian, defocus, floor = min(fits, key=lambda fit: min(fit[0].min(), fit[1].min()))
+    sigma, radius = float(BLUR_SIGMAS[gaussian.argmin()]), float(RADII[defocus.argmin()])
     motion = _motion(spectrum, floor, sigma, radius)
     if motion is not None:
         return motion
-    if defocus.cost < CLEARLY * gaussian.cost:
+    if defocus.min() < CLEARLY * gaussian.min():
         return Blur("defocus", radius, radius / 2)
     return Blur("gaussian", extra := extra_sigma(sigma), extra)
 
@@ -210,24 +197,24 @@ def _motion(spectrum: Spectrum, floor: float, sigma: float, radius: float) -> Bl
     frequency = np.hypot(*at)
     log_power = np.log(spectrum.power.ravel()[chosen] + FLOOR)
 
-    def fit(log_blurs: Floats) -> Fit:
+    def fit(log_blurs: Floats) -> Floats:
         return fit_blurs(frequency, log_power, POINT_ERROR, log_blurs, floor, steps=4)
 
     near = np.linspace(0.8, 1.2, 5)
     still = min(
-        fit(_round_blurs("gaussian", near * sigma, frequency, spectrum.step)).cost,
-        fit(_round_blurs("defocus", near * radius, frequency, spectrum.step)).cost,
+        fit(_round_blurs("gaussian", near * sigma, frequency, spectrum.step)).min(),
+        fit(_round_blurs("defocus", near * radius, frequency, spectrum.step)).min(),
     )
     coarse = fit(_coarse_motions(spectrum.tile))
-    if coarse.cost >= still:
+    if coarse.min() >= still:
         return None
-    angle = float(np.repeat(ANGLES, len(BLUR_LENGTHS))[coarse.best])
+    angle = float(np.repeat(ANGLES, len(BLUR_LENGTHS))[coarse.argmin()])
     lengths, angles = (a.ravel() for a in np.meshgrid(FINE_LENGTHS, angle + np.deg2rad([-4.0, 0.0, 4.0])))
     moved = fit(_motions(lengths, angles, at, spectrum.step))
-    length = float(lengths[moved.best])
-    if moved.cost >= CLEARLY * still:
+    length = float(lengths[moved.argmin()])
+    if moved.min() >= CLEARLY * still:
         return None
-    direction = float(np.rad2deg(angles[moved.best]) % 180)
+    direction = float(np.rad2deg(angles[moved.argmin()]) % 180)
     return Blur("motion", length, length / 12**0.5, direction)
 
 

@@ -107,8 +107,8 @@ class Sharpness:
         squares = (CHOICE_SIGMAS * np.abs(CHOICE_SIGMAS))[:, None]
         # `fit_blurs` expects a power law: the usual spectrum, as a blur of that law, takes its place.
         blurred = usual + SPECTRUM_SLOPE * np.log(self._frequency) - squares * self._frequency**2
-        fit = fit_blurs(self._frequency, mine, RING_ERROR, blurred, float(noise))
-        likely = CHOICE_SIGMAS[fit.costs <= fit.cost + 2.0]  # of the log-likelihood: two standard deviations
+        costs = fit_blurs(self._frequency, mine, RING_ERROR, blurred, float(noise))
+        likely = CHOICE_SIGMAS[costs <= costs.min() + 2.0]  # of the log-likelihood: two standard deviations
         return float(likely[np.abs(likely).argmin()])
 
 

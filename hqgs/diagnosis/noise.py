@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from hqgs.photos.jpeg import ENOUGH_BLOCKS, blocks_of
@@ -14,16 +12,9 @@ LIMIT, SMALL_LIMIT = 2.5, 4.0  # levels: photos of fine texture without noise re
 MIN_PATCHES, MAX_PATCHES = 200, 12_000  # that are needed, and that are looked at
 
 
-@dataclass(frozen=True)
-class Noise:
-    """White noise in a photo."""
-
-    level: float  # levels of 1/255 in each channel: standard deviation
-    limit: float  # levels: below this it could be fine texture
-
-
-def estimate_noise(levels: Floats) -> Noise | None:
-    """White noise in a photo [H, W, 3] of levels 0..255; None where too few pixels tell.
+def estimate_noise(levels: Floats) -> tuple[float, float] | None:
+    """White noise in a photo [H, W, 3] of levels 0..255: its standard deviation in each channel, and the
+    least that no fine texture reaches, levels; None where too few pixels tell.
 
     Patches of all three channels span a space in which texture fills few directions and white noise all of
     them, so the smallest eigenvalue of their covariance is the noise variance (Pyatenko 2013, Liu et al.
@@ -53,7 +44,7 @@ def estimate_noise(levels: Floats) -> Noise | None:
         flattest = np.linalg.eigh(here)[1][:, 0]
         variances.append(flattest @ there @ flattest)
     level = float(np.sqrt(max(np.mean(variances), 0.0)))
-    return Noise(level, LIMIT if size == LARGE_PATCH else SMALL_LIMIT)
+    return level, LIMIT if size == LARGE_PATCH else SMALL_LIMIT
 
 
 def neighbour_correlation(levels: Floats) -> float | None:

@@ -118,7 +118,7 @@ def inspect_photo(name: str, image: Photo, low: Photo | None = None, film: float
     film = film_detail(levels) if film is None else film
     found = replace(found, film=film, correlation=neighbour_correlation(levels))
     if not found.hiding and (noise := estimate_noise(levels)) is not None:
-        found = replace(found, noise=noise.level, noise_limit=noise.limit)
+        found = replace(found, noise=noise[0], noise_limit=noise[1])
     return Inspected(found, _kept(levels))
 
 

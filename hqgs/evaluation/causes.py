@@ -126,7 +126,7 @@ def causes(seen: RenderedView, maps: Maps, noise: float, fitted: RenderedView | 
 def noise_of(view: View) -> float:
     """Standard deviation of a photo's own noise, white is 1; 0 where texture could be it."""
     found = estimate_noise(to_levels(view.image, f"photo {view.name!r}"))
-    return found.level / 255 if found is not None and found.level > found.limit else 0.0
+    return found[0] / 255 if found is not None and found[0] > found[1] else 0.0
 
 
 def shares(of: Sequence[Causes]) -> dict[str, float]:
