@@ -22,13 +22,13 @@ from benchmarks.pages.rasterizing import unbeaten_default
 from benchmarks.patches import Knobs, tuned
 from benchmarks.protocol import Row, read_toml
 from benchmarks.rows import Table, facts
+from benchmarks.scenes.room.scene import embedded_scene
 from benchmarks.speed.inputs import LEAVES, RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import RasterPass
 from benchmarks.speed.timing import interleaved, quartiles
 from hqgs.base.threads import one_torch_thread
 from hqgs.base.typed import build
 from hqgs.model.render import render_view
-from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.scene import Scene
 from hqgs.training.methods.base import photo_tensors
 from hqgs.training.methods.photometric import photometric_loss

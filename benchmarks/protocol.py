@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.scenes.room.scene import embedded_scene
 from benchmarks.scenes.rooms import is_room, room
 from hqgs.base.typed import build
 from hqgs.photos.formula import parse_degradation
-from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.formats.degradation_json import FILE
 from hqgs.scene.formats.llff import hold_marker

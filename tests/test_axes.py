@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 import hqgs
+from benchmarks.scenes.room.shading import render_view
 from benchmarks.scenes.sparse import sparse_cameras
 from hqgs.scene.axes import TURNED, with_true_axes
-from hqgs.scene.builtin.shading import render_view
 from hqgs.scene.scene import View
 
 

@@ -31,8 +31,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """The tiny scene in place of the embedded one; the list gets the arguments that it was asked with."""
     calls: list[dict[str, Any]] = []
 
-    def embedded(cache: Path | None, width: int, height: int) -> Scene:
-        calls.append({"cache": cache, "size": (width, height)})
+    def embedded(width: int, height: int) -> Scene:
+        calls.append({"size": (width, height)})
         return tiny_scene()
 
     monkeypatch.setattr(source, "embedded_scene", embedded)
@@ -57,7 +57,7 @@ def test_train_the_embedded_scene(
     options = ["--iterations", "20", "--seed", "3", "--max-gaussians", "55", "--eval-every", "7"]
     options += ["--method", "3dgs"]
     assert call("train", "embedded", "--out", out, "--downscale", "2", *options) == 0
-    assert asked == [{"cache": out / "scene", "size": (252, 189)}]
+    assert asked == [{"size": (252, 189)}]
     report = json.loads((out / "report.json").read_text())
     assert (report["iterations"], report["seed"], report["method"]) == (20, 3, "3dgs")
     assert report["config"]["densify"]["max_gaussians"] == 55
@@ -115,7 +115,7 @@ def test_degrade_writes_a_scene_that_trains(
     bad = tmp_path / "bad"
     command = ["degrade", "embedded", "--kind", "lowres:2+jpeg:30", "--out", bad, "--downscale", "2"]
     assert call(*command, "--seed", "4") == 0
-    assert asked == [{"cache": None, "size": (252, 189)}]
+    assert asked == [{"size": (252, 189)}]
     told = capsys.readouterr().out
     assert told.endswith(f"{bad}: 5 training photos with lowres:2+jpeg:30, 1 held out\n")
     assert json.loads((bad / "degradation.json").read_text())["seed"] == 4
@@ -132,7 +132,7 @@ def test_diagnose_prints_and_writes_what_it_found(
 ) -> None:
     out = tmp_path / "diagnosis.json"
     assert call("diagnose", "embedded", "--downscale", "2", "--out", out) == 0
-    assert asked == [{"cache": None, "size": (252, 189)}]
+    assert asked == [{"size": (252, 189)}]
     printed, written = capsys.readouterr().out, json.loads(out.read_text())
     assert len(written["photos"]) == 5
     assert [part["name"] for part in written["parts"]] == [

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import hqgs
-from hqgs.scene.builtin.scene import embedded_scene
+from benchmarks.scenes.room.scene import embedded_scene
 from hqgs.scene.scene import Scene
 
 # Photos; what they are taken for; iterations; of the held-out views PSNR (dB): floor, lowest and highest of

@@ -7,11 +7,11 @@ import pytest
 from scipy import stats
 from scipy.ndimage import gaussian_filter
 
+from benchmarks.scenes.room.shading import render_view
 from benchmarks.scenes.sparse import ARC, HIGH, LOW, camera_on_arc
 from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.evaluation.intervals import SPREAD_LOGS, SPREADS, difference, half_width, with_half
 from hqgs.evaluation.metrics import psnr
-from hqgs.scene.builtin.shading import render_view
 
 
 def test_it_is_the_interval_of_student() -> None:

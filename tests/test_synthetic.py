@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hqgs.scene import known_points
-from hqgs.scene.builtin import scene, shading
-from hqgs.scene.builtin.raycast import Box, Cylinder, Ellipsoid, Panel, Shape, Surface, Torus, nearest
-from hqgs.scene.builtin.scene import embedded_cameras, embedded_scene, look_at, sfm_points, surface_points
-from hqgs.scene.builtin.shading import render_depth, render_view
-from hqgs.scene.builtin.studio import studio
+from benchmarks.scenes.room import scene, shading
+from benchmarks.scenes.room.raycast import Box, Cylinder, Ellipsoid, Panel, Shape, Surface, Torus, nearest
+from benchmarks.scenes.room.scene import embedded_cameras, embedded_scene, look_at, sfm_points, surface_points
+from benchmarks.scenes.room.shading import render_depth, render_view
+from benchmarks.scenes.room.studio import studio
+from hqgs.scene import known_points, room
 from hqgs.scene.known_points import with_points
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.sfm import triangulated
@@ -373,3 +373,19 @@ def test_surfaces_are_described_well() -> None:
     wires = [s for s in studio().surfaces if isinstance(s.shape, Cylinder) and s.shape.radius < 0.01]
     assert len(wires) > 40
     assert all(isinstance(s, Surface) and not s.shadow for s in wires)
+
+
+def test_what_is_installed_is_what_is_ray_cast() -> None:
+    made = room.embedded_scene(504, 378)
+    assert (len(made.train), len(made.test)) == (21, 3)
+    views = sorted([*made.train, *made.test], key=lambda view: view.name)
+    for k, camera in enumerate(embedded_cameras()):
+        np.testing.assert_array_equal(views[k].camera.K, camera.K)
+        np.testing.assert_array_equal(views[k].camera.viewmat, camera.viewmat)
+    np.testing.assert_array_equal(views[5].image, render_view(embedded_cameras()[5]))
+    assert made.seen is not None
+    assert np.median(depth_error([views[5]], made.points[made.seen["view_05.png"]])) < 0.01
+    small = room.embedded_scene(63, 47)
+    assert {view.image.shape for view in small.train} == {(47, 63, 3)}
+    with pytest.raises(ValueError, match="each side needs 8"):
+        room.embedded_scene(9, 7)

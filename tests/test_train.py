@@ -17,12 +17,12 @@ from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
 import hqgs
+from benchmarks.scenes.room.scene import embedded_scene
 from hqgs.base.files import CHECKPOINT, PLY
 from hqgs.base.interrupt import ENDINGS
 from hqgs.evaluation import held_out
 from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import open_run, run_to_end, train
-from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.scene import Scene, View
 from hqgs.training import forward
 from hqgs.training.config import DensifyConfig, TrainConfig, check_method

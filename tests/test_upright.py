@@ -1,4 +1,4 @@
-"""Up in a scene, by edges of the built-in room, and by points of a level surface."""
+"""Up in a scene, by edges of the built-in room."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from hqgs.scene.builtin.scene import embedded_cameras
-from hqgs.scene.builtin.shading import render_view
+from benchmarks.scenes.room.scene import embedded_cameras
+from benchmarks.scenes.room.shading import render_view
 from hqgs.scene.formats.colmap import write_colmap
 from hqgs.scene.georeference import Georeference
 from hqgs.scene.paths import scene_up
@@ -70,23 +70,6 @@ def test_up_is_sought_where_a_scene_is_to_be_trained(room: Scene, tmp_path: Path
     looked_at = load(tmp_path, test_every=0, points=False)
     assert looked_at.world.up is None
     assert looked_at.notes == told.notes[:-1]
-
-
-def test_a_floor_tells_up_where_photos_do_not(room: Scene) -> None:
-    rng = np.random.default_rng(1)
-    flat = np.column_stack([rng.uniform(-3, 3, 400), rng.normal(0, 0.01, 400), rng.uniform(-3, 3, 400)])
-    points = np.concatenate([flat, rng.uniform(-3, 3, (400, 3))]) @ TURN.T
-    bare = replace(room, train=noise(room), test=[])
-    found = with_up(replace(bare, points=points, point_colors=np.zeros((800, 3), np.uint8)))
-    assert degrees(scene_up(found), UP) < 0.3
-    assert "level surface" in found.notes[0]
-    steep = Rotation.from_euler("x", 40, degrees=True).as_matrix()
-    for other in (points @ steep, points[400:]):
-        kept = with_up(replace(bare, points=other, point_colors=np.zeros((len(other), 3), np.uint8)))
-        assert kept.world.up is None
-        assert "as the photos were held" in kept.notes[0]
-    guessed = with_up(replace(bare, points=points, guessed=True))
-    assert guessed.world.up is None
 
 
 def test_gps_tells_up_where_it_is_sure(room: Scene) -> None:

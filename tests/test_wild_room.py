@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from benchmarks.scenes import wild
 from benchmarks.scenes.exposure import path_viewmats, render_exposure, shaken, spread, still, through_lens
+from benchmarks.scenes.room import scene
+from benchmarks.scenes.room.scene import embedded_cameras, surface_points
+from benchmarks.scenes.room.shading import render_depth, render_view, sample_pattern
 from benchmarks.scenes.shake import path_points
 from benchmarks.scenes.sparse import TABLE, sparse_cameras, sparse_room
 from benchmarks.scenes.wild import DISTANCE, TRUE_KINDS, PhotoTruth, parse_true_kind, wild_room
-from hqgs.scene.builtin import scene
-from hqgs.scene.builtin.scene import embedded_cameras, surface_points
-from hqgs.scene.builtin.shading import render_depth, render_view, sample_pattern
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.sfm.triangulated import SparsePoints
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.scenes.room.shading import encode, render_light, to_bytes
 from benchmarks.scenes.shake import exposure_times, path_points
 from hqgs.photos.formation import GOLDEN
-from hqgs.scene.builtin.shading import encode, render_light, to_bytes
 from hqgs.scene.scene import Camera
 
 Floats = NDArray[np.float64]

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
+from benchmarks.scenes.room.scene import assemble
+from benchmarks.scenes.room.shading import render_view
 from benchmarks.scenes.wild import WildRoom, kept_photos
 from hqgs.photos.light import to_linear, to_srgb
-from hqgs.scene.builtin.scene import assemble
-from hqgs.scene.builtin.shading import render_view
 from hqgs.scene.faces import CUBE, around, face_name, faces_of
 from hqgs.scene.scene import Camera
 from hqgs.scene.views import to_pinhole

@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.scenes.panorama import WIDTH, panorama_room
+from benchmarks.scenes.room.scene import embedded_scene
 from benchmarks.scenes.sparse import PHOTOS, beyond_room, sparse_room
 from benchmarks.scenes.wild import TRUE_KINDS, wild_room
-from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.constants import PATH_SIZE
 from hqgs.scene.names import EMBEDDED
 from hqgs.scene.scene import Scene

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.builtin.scene import HEIGHT, WIDTH, assemble, intrinsics, look_at
+from benchmarks.scenes.room.scene import HEIGHT, WIDTH, assemble, intrinsics, look_at
 from hqgs.scene.scene import Camera, Scene
 
 TABLE = (0.0, 0.40, 3.3)  # above the middle of the table top; what the cameras look at

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from benchmarks.scenes.devices import Device, draw_devices
 from benchmarks.scenes.exposure import Exposure, render_exposure, shaken, still, through_lens
 from benchmarks.scenes.kinds import draw_gains
+from benchmarks.scenes.room.scene import FOCUS, HEIGHT, WIDTH, embedded_scene, keep, kept
+from benchmarks.scenes.room.shading import sample_pattern
 from benchmarks.scenes.shake import draw_path, draw_strength, knots_mean, path_extent, path_length
 from hqgs.photos.formula import Kind
-from hqgs.scene.builtin.scene import FOCUS, HEIGHT, WIDTH, embedded_scene, keep, kept
-from hqgs.scene.builtin.shading import sample_pattern
 from hqgs.scene.scene import Camera, Scene
 
 Floats = NDArray[np.float64]

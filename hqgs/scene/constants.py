@@ -41,7 +41,7 @@ BACKGROUND = (0.0, 0.0, 0.0)  # RGB behind everything, in renders and cut-out ph
 EMPTY = 255  # of `View.empty`: nothing of the pixel shows anything
 RANDOM_POINTS = 20_000  # to start from where a scene has none
 
-# Up, by upright edges and level surfaces; tried on the room and on 13 captures of others.
+# Up, by upright edges; tried on the room and on 13 captures of others.
 UP_CONE = 15.0  # degrees from how the photos were held, at most
 UP_SURE = 1.0  # degrees: a wider 95 % interval is no answer
 UP_PHOTOS = 24  # spread over the scene
@@ -50,7 +50,6 @@ EDGE_LENGTH, EDGE_WIDTH = 0.04, 5.0  # of a photo's longer side, least; px, most
 EDGE_OFF = 0.7  # degrees, sigma, that an upright edge may be off
 EDGES_FEWEST, EDGES_SHARE = 20, 0.3  # upright ones; their share of the length of those within UP_CONE
 EDGES_CLEAR = 2.5  # times what meets in the directions around
-LEVEL_SHARE, LEVEL_THIN = 0.25, 0.01  # of the points; of their spread, to either side
 
 # Camera paths.
 # px (of photos of built-in rooms too), degrees, where nothing else is said.

@@ -16,8 +16,7 @@ from typing import Any
 from hqgs.base.stages import OnStage, silent
 from hqgs.base.state import own_state
 from hqgs.photos.formula import parse_degradation
-from hqgs.scene.builtin.scene import HEIGHT, WIDTH, embedded_scene
-from hqgs.scene.constants import TEST_EVERY
+from hqgs.scene.constants import PATH_SIZE, TEST_EVERY
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import check_film, film_frames
 from hqgs.scene.known_points import with_points
@@ -27,6 +26,7 @@ from hqgs.scene.names import EMBEDDED, KEPT, is_room
 from hqgs.scene.options import LoadOptions
 from hqgs.scene.photo_files import film_at
 from hqgs.scene.restore import check_weights, restore_scene
+from hqgs.scene.room import embedded_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
 from hqgs.scene.upright import as_asked, direction_of, with_up
@@ -67,8 +67,7 @@ def load(
         skip_unreadable: leave out photos that cannot be read, or are of another shape than their camera, as
             long as half of the photos to train on, and of those held out, remain; `Scene.notes` names them.
             False: an error.
-        cache: a folder that keeps what takes long, for the next call: COLMAP's models, the frames of a film,
-            the embedded scene.
+        cache: a folder that keeps what takes long, for the next call: COLMAP's models, the frames of a film.
         longest: px; scale the photos down further where a side is longer, or where all photos together
             would take more than 4 GB of memory.
         coarse: whether COLMAP may look at photos alone coarsely, which is faster, to find their cameras;
@@ -126,7 +125,7 @@ def load_as(
         check_film(asked.path)
     kept = None if cache is None else Path(cache)
     models = None if kept is None else kept / KEPT
-    scene = _room(asked, kept) if named else _read(asked, kept, models, apart, on_stage)
+    scene = _room(asked) if named else _read(asked, kept, models, apart, on_stage)
     if degradation.steps:
         scene = degrade_scene(scene, degradation, asked.seed)
     if asked.sfm and (scene.source != "photos" or degradation.steps):
@@ -141,7 +140,7 @@ def load_as(
     return replace(scene, origin=json.loads(json.dumps(kept_as)))
 
 
-def _room(asked: LoadOptions, kept: Path | None) -> Scene:
+def _room(asked: LoadOptions) -> Scene:
     """The built-in scene."""
     if asked.path != EMBEDDED:
         raise ValueError(f"there is no built-in scene {asked.path!r}")
@@ -151,8 +150,8 @@ def _room(asked: LoadOptions, kept: Path | None) -> Scene:
         raise ValueError(
             f"test_every is {asked.test_every}, but the built-in scene holds out every {TEST_EVERY}th"
         )
-    width, height = (round(side / asked.downscale) for side in (WIDTH, HEIGHT))
-    return embedded_scene(None if kept is None else kept / "scene", width, height)
+    width, height = (round(side / asked.downscale) for side in PATH_SIZE)
+    return embedded_scene(width, height)
 
 
 def _read(

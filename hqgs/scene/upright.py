@@ -1,4 +1,4 @@
-"""Up, by what stands upright or lies level in a scene: edges in its photos, or points of a floor or table.
+"""Up, by what stands upright in a scene: edges in its photos.
 
 An edge in a photo and the camera's centre span a plane. Whatever stands upright, up lies in the planes of its
 edges, so that up is where most planes of edges that are nearly upright meet. One photo's edges tell it to a
@@ -27,8 +27,6 @@ from hqgs.scene.constants import (
     EDGES_CLEAR,
     EDGES_FEWEST,
     EDGES_SHARE,
-    LEVEL_SHARE,
-    LEVEL_THIN,
     UP_CONE,
     UP_PHOTOS,
     UP_SURE,
@@ -36,11 +34,10 @@ from hqgs.scene.constants import (
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.paths import scene_up
 from hqgs.scene.scene import Scene, View
-from hqgs.scene.world import middle_and_size
 
 Floats = NDArray[np.float64]
-_DRAWS = 100  # of photos, to see how far the answer moves; ten times as many of three points
-_LEAN = 0.5  # degrees that walls, furniture and floors are off themselves; 40 draws of photos of the room
+_DRAWS = 100  # of photos, to see how far the answer moves
+_LEAN = 0.5  # degrees that walls and furniture are off themselves; 40 draws of photos of the room
 _LEAST = 3  # photos with upright edges
 _NEAR = math.cos(math.radians(UP_CONE))
 
@@ -49,7 +46,7 @@ class Up(NamedTuple):
     """Up in a scene, and who says so."""
 
     direction: Floats  # [3], unit, world
-    error: float  # degrees: it is no farther off in 95 % of cases, if what tells it is upright, or level
+    error: float  # degrees: it is no farther off in 95 % of cases, if what tells it is upright
     said: str
 
 
@@ -68,7 +65,7 @@ def as_asked(scene: Scene, up: Floats) -> Scene:
 
 
 def with_up(scene: Scene) -> Scene:
-    """The scene with up as edges, a level surface or GPS tell it, in this order; a note says which.
+    """The scene with up as edges or GPS tell it, in this order; a note says which.
 
     Where none does, up stays as the photos were held (`scene_up`).
     """
@@ -76,9 +73,9 @@ def with_up(scene: Scene) -> Scene:
     views = [*scene.train, *scene.test]
     if max(max(view.camera.width, view.camera.height) for view in views) < EDGE_WIDTH / EDGE_LENGTH:
         return scene
-    found = by_edges(views, before) or by_surface(scene, before) or _by_gps(scene)
+    found = by_edges(views, before) or _by_gps(scene)
     if found is None:
-        note = "up is as the photos were held: no upright edges, level surface or GPS tell it better"
+        note = "up is as the photos were held: no upright edges or GPS tell it better"
         return replace(scene, notes=[*scene.notes, note])
     moved = math.degrees(math.acos(min(float(found.direction @ before), 1.0)))
     why = (
@@ -118,40 +115,6 @@ def by_edges(views: Sequence[View], before: Floats) -> Up | None:
     if not told or photos < _LEAST or error > UP_SURE or up @ before < _NEAR:
         return None
     return Up(up, error, f"{upright.sum()} upright edges in {photos} photos")
-
-
-def by_surface(scene: Scene, before: Floats) -> Up | None:
-    """Up within UP_CONE of `before`, square to the plane that holds many points; None: there is none.
-
-    Not by guessed points, and not where photos have GPS: ground outdoors is seldom level.
-    """
-    if scene.guessed or scene.world.place is not None or len(scene.points) < 10 * EDGES_FEWEST:
-        return None
-    points = scene.points.astype(np.float64)
-    middle, _ = middle_and_size(points, points)
-    away = np.linalg.norm(points - middle, axis=1)
-    size = float(np.median(away))
-    points, rng = (points[away < 4 * size] - middle) / size, np.random.default_rng(0)
-    some = points[rng.permutation(len(points))[: 20 * _DRAWS]]
-    held = points[:0]
-    for a, b, c in some[rng.integers(0, len(some), (10 * _DRAWS, 3))]:
-        normal = np.cross(b - a, c - a)
-        length = float(np.linalg.norm(normal))
-        if abs(normal @ before) > _NEAR * length > 0:
-            flat = some[np.abs(_along(some - a, normal)) < LEVEL_THIN * length]
-            held = max(held, flat, key=len)
-    if not len(held):
-        return None
-    up, error = before, math.inf
-    for _ in range(10):  # it settles sooner
-        at = held.mean(0)
-        values, axes = np.linalg.eigh(np.einsum("ni,nj->ij", held - at, held - at) / len(held))
-        up = axes[:, 0] * np.sign(axes[:, 0] @ before)
-        error = math.degrees(math.sqrt(max(values[0], 0) / max(values[1], 1e-12)))
-        held = points[np.abs(_along(points - at, up)) < LEVEL_THIN]
-    if len(held) < LEVEL_SHARE * len(points) or error > UP_SURE or up @ before < _NEAR:
-        return None
-    return Up(up, max(error, _LEAN), f"a level surface that holds {len(held)} of the points")
 
 
 def _by_gps(scene: Scene) -> Up | None:

@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
+from benchmarks.scenes.room.shading import render_depth, render_view
 from hqgs.base.files import atomic_path
 from hqgs.photos.formation import GOLDEN
 from hqgs.scene import paths
-from hqgs.scene.builtin.shading import render_depth, render_view
 from hqgs.scene.constants import PATH_SIZE, TEST_EVERY
 from hqgs.scene.geometry import unproject
+from hqgs.scene.room import FOLDER
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.sfm.triangulated import TRIANGULATION, SparsePoints, in_order, triangulated
 
@@ -192,3 +194,18 @@ def surface_points(
     xyz = np.concatenate(points).astype(np.float32)
     note = f"{count} points cast onto the surfaces"
     return in_order(xyz, np.concatenate(colors), np.concatenate(photos), np.arange(count), note)
+
+
+def write_room(folder: Path) -> None:
+    """What `hqgs/scene/room` holds: photos without loss, cameras and points."""
+    cameras = embedded_cameras()
+    views = [View(f"view_{k:02d}.png", camera, render_view(camera)) for k, camera in enumerate(cameras)]
+    for k, view in enumerate(views):
+        Image.fromarray(view.image).save(folder / f"{k:02d}.webp", lossless=True, quality=100, method=6)
+    points = sfm_points([view for k, view in enumerate(views) if k % TEST_EVERY])
+    viewmats = np.stack([camera.viewmat for camera in cameras])
+    np.savez_compressed(folder / "room.npz", K=cameras[0].K, viewmats=viewmats, **points._asdict())
+
+
+if __name__ == "__main__":
+    write_room(FOLDER)

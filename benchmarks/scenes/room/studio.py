@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.builtin import textures as tx
-from hqgs.scene.builtin.raycast import Box, Cylinder, Ellipsoid, Material, Panel, Surface, Torus
+from benchmarks.scenes.room import textures as tx
+from benchmarks.scenes.room.raycast import Box, Cylinder, Ellipsoid, Material, Panel, Surface, Torus
 
 Point = tuple[float, float, float]
 

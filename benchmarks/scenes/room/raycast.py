@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.builtin.textures import Texture
+from benchmarks.scenes.room.textures import Texture
 
 Vec = tuple[Any, Any, Any]  # x, y, z: arrays or floats that broadcast
 Array = NDArray[np.floating]

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.scenes.room.raycast import Array, Surface, Vec, along, dot, in_view, nearest
+from benchmarks.scenes.room.studio import Studio, studio
 from hqgs.photos.light import to_srgb
-from hqgs.scene.builtin.raycast import Array, Surface, Vec, along, dot, in_view, nearest
-from hqgs.scene.builtin.studio import Studio, studio
 from hqgs.scene.scene import Camera
 
 TILE, BLOCK = 64, 8  # pixels: a tile is one job; each surface is tried on the blocks that it may cover
