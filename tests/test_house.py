@@ -16,12 +16,7 @@ FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.
 PACKAGES = [path for path in FILES if path.name == "__init__.py"]
 OF_PYTHON = {"__init__.py", "__main__.py", "__pycache__", "_rust.abi3.so", "_rust.pyi", "py.typed"}
 MOST_LAYERS, MOST_LINES, MOST_IN_FUNCTION = 12, 700, 60
-LONG = {  # formats of many dialects
-    "read_colmap",
-    "_camera",
-    "sfm_scene",
-    "load_scene",
-}
+LONG = {"load_scene"}
 
 
 def relative(path: Path) -> str:

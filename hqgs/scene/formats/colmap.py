@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -91,46 +92,10 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     path, for `load_scene` to name. Raises ValueError for a damaged model, FileNotFoundError where no camera
     has a photo.
     """
-    found = find_models(root) or find_models_below(root)
-    told: dict[Path, list[str]] = {path: [] for path in found}
-    models = {path: _read_model(path, told[path]) for path in found}
-    path = max(models, key=lambda p: (len(_registered(models[p])), models[p].num_points3D()))
-    model, notes = models.pop(path), told[path]
-    if path not in find_models(root):
-        notes.append(f"the COLMAP model is the one in {path.relative_to(root)}")
-    if models:
-        others = ", ".join(f"{p.name}: {len(_registered(m))}" for p, m in models.items())
-        notes.append(
-            f"{len(models) + 1} COLMAP models: took the largest, {path.relative_to(root)}, with "
-            f"{len(_registered(model))} photos (photos in the others: {others})"
-        )
-    try:
-        by_name = sorted((image.name, image.image_id) for image in _registered(model))
-    except UnicodeDecodeError as e:  # of an image that the file's lines do not number alike: damaged
-        raise ValueError(f"{path}: the name of a photo cannot be read: {e}") from e
-    if not by_name:
-        raise ValueError(f"{path}: the COLMAP model has no registered photo")
-    names = [name for name, _ in by_name]
-    twice = sorted({n for n in names if names.count(n) > 1}) if len(set(names)) < len(names) else []
-    if twice:
-        raise ValueError(f"{path}: photo names appear more than once: {some(twice)}")
-
-    folder, left, files = photos_of(names, root, path, downscale, notes)
-    details, masks = frame_details(folder), masks_of(root, folder, names)
-    photos = []
-    for name, image_id in by_name:
-        image = model.images[image_id]
-        camera = model.cameras[image.camera_id]
-        try:
-            viewmat = pose_viewmat(image.cam_from_world(), name)
-        except ValueError as e:
-            raise ValueError(f"{path}: {e}") from e
-        file = files.get(name)
-        film = None
-        if file is not None and file.is_relative_to(folder):
-            film = details.get(file.relative_to(folder).as_posix())
-        absent = folder / name if file is None else file
-        photos.append(Photo(name, absent, camera, viewmat, masks.get(name), film))
+    path, model, notes = _largest_model(root)
+    images = _images(model, path)
+    folder, left, files = photos_of([*images], root, path, downscale, notes)
+    photos = _photos(model, images, path, files, folder, root)
     used = set(files.values())
     if len(used) < len(files):
         shared = [n for n, p in files.items() if list(files.values()).count(p) > 1]
@@ -139,11 +104,11 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     if unused:
         notes.append(f"{len(unused)} photos have no camera (COLMAP did not register them): {some(unused)}")
     test_names = None
-    split, known = listed_split([path, root], root), names_by_any(names)
+    split, known = listed_split([path, root], root), names_by_any([*images])
     if split is not None and not split.names_any(known):
         notes.append(f"{split.source} names none of the photos: it is not taken for a split")
     elif split is not None:
-        kept, test_names = held_out(split, names, known, notes)
+        kept, test_names = held_out(split, [*images], known, notes)
         photos = [photo for photo in photos if photo.name in kept | test_names]
     points, colors = keep_finite(*(model_points(model) if model.points3D else _points(path, notes)), notes)
     tracks = _tracks(model, path)
@@ -162,6 +127,60 @@ def read_colmap(root: Path, downscale: float) -> Capture:
         tracks=tracks,
         seen=seen,
     )
+
+
+def _largest_model(root: Path) -> tuple[Path, pycolmap.Reconstruction, list[str]]:
+    """The model with most photos, where it is, and notes."""
+    found = find_models(root) or find_models_below(root)
+    told: dict[Path, list[str]] = {path: [] for path in found}
+    models = {path: _read_model(path, told[path]) for path in found}
+    path = max(models, key=lambda p: (models[p].num_reg_images(), models[p].num_points3D()))
+    model, notes = models.pop(path), told[path]
+    if path not in find_models(root):
+        notes.append(f"the COLMAP model is the one in {path.relative_to(root)}")
+    if models:
+        others = ", ".join(f"{p.name}: {m.num_reg_images()}" for p, m in models.items())
+        notes.append(
+            f"{len(models) + 1} COLMAP models: took the largest, {path.relative_to(root)}, with "
+            f"{model.num_reg_images()} photos (photos in the others: {others})"
+        )
+    return path, model, notes
+
+
+def _images(model: pycolmap.Reconstruction, path: Path) -> dict[str, pycolmap.Image]:
+    """The photos of a model that have a place, by name, sorted."""
+    try:
+        images = sorted((i.name, i.image_id) for i in model.images.values() if i.has_pose)
+    except UnicodeDecodeError as e:  # of an image that the file's lines do not number alike: damaged
+        raise ValueError(f"{path}: the name of a photo cannot be read: {e}") from e
+    if not images:
+        raise ValueError(f"{path}: the COLMAP model has no registered photo")
+    counts = Counter(name for name, _ in images)
+    if twice := [name for name, count in counts.items() if count > 1]:
+        raise ValueError(f"{path}: photo names appear more than once: {some(twice)}")
+    return {name: model.images[image_id] for name, image_id in images}
+
+
+def _photos(
+    model: pycolmap.Reconstruction,
+    images: dict[str, pycolmap.Image],
+    path: Path,
+    files: dict[str, Path],
+    folder: Path,
+    root: Path,
+) -> list[Photo]:
+    """The photos of the model at `path`; one that has no file lies where it should in the folder."""
+    details, masks, photos = frame_details(folder), masks_of(root, folder, [*images]), list[Photo]()
+    for name, image in images.items():
+        file, film = files.get(name, folder / name), None
+        if name in files and file.is_relative_to(folder):
+            film = details.get(file.relative_to(folder).as_posix())
+        try:
+            viewmat = pose_viewmat(image.cam_from_world(), name)
+        except ValueError as e:
+            raise ValueError(f"{path}: {e}") from e
+        photos.append(Photo(name, file, model.cameras[image.camera_id], viewmat, masks.get(name), film))
+    return photos
 
 
 def _points(folder: Path, notes: list[str]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
@@ -209,10 +228,6 @@ def _read_whole(folder: Path, binary: bool) -> pycolmap.Reconstruction:
         if actual != size:
             raise ValueError(f"{folder / 'cameras.bin'} is damaged: {size} bytes expected, it has {actual}")
     return model
-
-
-def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    return [image for image in model.images.values() if image.has_pose]
 
 
 def pose_viewmat(pose: pycolmap.Rigid3d, name: str) -> NDArray[np.float64]:

@@ -221,74 +221,75 @@ def _mask_path(root: Path, written: str) -> Path | None:
     return None
 
 
+def _number(values: dict[str, Any], key: str, where: str) -> float | None:
+    """What a file says under a key; None: nothing."""
+    value = values.get(key)
+    if value is None:
+        return None
+    if isinstance(value, str):
+        with suppress(ValueError):
+            value = float(value)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not -1e300 < value < 1e300:
+        raise ValueError(f"{where}: {key} must be a finite number, got {value!r:.80}")
+    return float(value)
+
+
 def _camera(values: dict[str, Any], path: Path, where: str) -> pycolmap.Camera:
     """The camera from the file's values, overridden by the frame's."""
-
-    def number(key: str, default: float | None = None) -> float | None:
-        value = values.get(key, default)
-        if value is None:
-            return None
-        if isinstance(value, str):
-            with suppress(ValueError):
-                value = float(value)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not -1e300 < value < 1e300:
-            raise ValueError(f"{where}: {key} must be a finite number, got {value!r:.80}")
-        return float(value)
-
-    def coefficient(key: str) -> float:
-        return number(key) or 0.0
-
     told = values.get("camera_model", "OPENCV")
     model = told.upper() if isinstance(told, str) else told
     if model not in _PERSPECTIVE | _FISHEYE | {AROUND}:
         known = sorted(_PERSPECTIVE | _FISHEYE | {AROUND})
         raise ValueError(f"{where}: camera_model {told!r:.80} is none of {known}")
-    width, height = number("w"), number("h")
+    width, height = (_number(values, key, where) for key in ("w", "h"))
     if width is None or height is None:
         width, height = stored_size(path)
     if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
         raise ValueError(f"{where}: w, h = {width}, {height} is no photo size")
     if model == AROUND:
         return around(round(width), round(height))
-    fx = _focal(number("fl_x"), number("camera_angle_x"), width, where)
-    fy = _focal(number("fl_y"), number("camera_angle_y"), height, where)
-    if fx is None and fy is None:
+    kind, distortion = _lens(values, model, where)
+    params = [*_pinhole(values, width, height, where), *distortion]
+    return pycolmap.Camera(model=kind, width=round(width), height=round(height), params=params)
+
+
+def _pinhole(values: dict[str, Any], width: float, height: float, where: str) -> list[float]:
+    """Focal lengths and principal point, px."""
+    fx, fy, across, down, cx, cy = (_number(values, key, where) for key in (*_FOCALS, *_ANGLES, "cx", "cy"))
+    fx, fy = _focal(fx, across, width, where), _focal(fy, down, height, where)
+    either = fy if fx is None else fx
+    if either is None:
         raise ValueError(
             f"{where}: no focal length: looked for fl_x, fl_y, camera_angle_x, camera_angle_y and a matrix "
             f"{', '.join(MATRICES)}"
         )
-    fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
-    pinhole = [fx, fy, number("cx", width / 2), number("cy", height / 2)]
-    if (
-        all(value is not None and 0 < value <= 1 for value in pinhole[2:])
-        and min(width, height) > SMALLEST_SIDE
-    ):
+    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    if 0 < cx <= 1 and 0 < cy <= 1 and min(width, height) > SMALLEST_SIDE:
         raise ValueError(
-            f"{where}: cx, cy = {pinhole[2]:g}, {pinhole[3]:g} are shares of w, h = {width:g}, {height:g}: "
-            "multiply fl_x, fl_y, cx and cy by them, px are wanted"
+            f"{where}: cx, cy = {cx:g}, {cy:g} are shares of w, h = {width:g}, {height:g}: multiply fl_x, "
+            "fl_y, cx and cy by them, px are wanted"
         )
+    return [either if fx is None else fx, either if fy is None else fy, cx, cy]
 
+
+def _lens(values: dict[str, Any], model: str, where: str) -> tuple[str, list[float]]:
+    """COLMAP's model, and its coefficients of distortion."""
     order = ("k1", "k2", "k3", "k4", "p1", "p2")  # of nerfstudio's list
     listed = values.get("distortion_params")
     if listed is not None:
         if not isinstance(listed, list) or len(listed) > len(order):
             raise ValueError(f"{where}: distortion_params must be k1 k2 k3 k4 p1 p2, got {listed!r:.80}")
         values = {**values, **dict(zip(order, listed, strict=False))}
-    k1, k2, k3, k4, p1, p2 = (coefficient(k) for k in order)
+    k1, k2, k3, k4, p1, p2 = (_number(values, key, where) or 0.0 for key in order)
     if model in _FISHEYE or values.get("is_fisheye"):
         if p1 or p2:
             raise ValueError(f"{where}: a fisheye with p1, p2 = {p1}, {p2} is no OpenCV fisheye")
-        kind, params = "OPENCV_FISHEYE", [*pinhole, k1, k2, k3, k4]
-    elif k4:
-        # The one k4 of a perspective camera is r^8 here and a denominator in OpenCV.
+        return "OPENCV_FISHEYE", [k1, k2, k3, k4]
+    if k4:  # the one k4 of a perspective camera is r^8 here and a denominator in OpenCV
         raise ValueError(f"{where}: k4 = {k4} has no agreed meaning for a {model} camera")
-    elif k3:
-        kind, params = "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0, 0, 0]
-    elif k1 or k2 or p1 or p2:
-        kind, params = "OPENCV", [*pinhole, k1, k2, p1, p2]
-    else:
-        kind, params = "PINHOLE", pinhole
-    return pycolmap.Camera(model=kind, width=round(width), height=round(height), params=params)
+    if k3:
+        return "FULL_OPENCV", [k1, k2, p1, p2, k3, 0, 0, 0]
+    return ("OPENCV", [k1, k2, p1, p2]) if k1 or k2 or p1 or p2 else ("PINHOLE", [])
 
 
 def _focal(focal: float | None, angle: float | None, size: float, where: str) -> float | None:

@@ -6,14 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.formats.colmap import seen_points
 from hqgs.scene.scene import Scene, SfmReport, TrackStatistics, View
-from hqgs.scene.sfm.align import align, camera_centers, pose_auc, refine, rotation_angles
+from hqgs.scene.sfm.align import Floats, align, camera_centers, pose_auc, refine, rotation_angles
 from hqgs.scene.sfm.refine.tracks import read_tracks, sureness
 from hqgs.scene.sfm.run import run_colmap
 from hqgs.scene.sfm.triangulated import write_photos
@@ -58,17 +57,13 @@ def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent
         replace(view, camera=replace(view.camera, viewmat=viewmat))
         for view, viewmat in zip(kept, viewmats, strict=True)
     ]
-    degrees = np.rad2deg(rotation_angles(np.einsum("nij,nkj->nik", viewmats[:, :3, :3], own[:, :3, :3])))
-    apart = np.linalg.norm(camera_centers(viewmats) - camera_centers(own), axis=1) / scene.extent
-    distances, _ = KDTree(scene.points).query(points)
     tracks = TrackStatistics(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
     off = float(np.median(misses))  # infinite where the own cameras have most of the points behind them
+    distances, _ = KDTree(scene.points).query(points)
     report = SfmReport(
         photos=len(views),
         not_registered=[view.name for file, view in views.items() if file not in poses],
         outliers=[view.name for view, inlier in zip(kept, inliers, strict=True) if not inlier],
-        rotation_error_deg=_median_and_max(degrees),
-        translation_error=_median_and_max(apart),
         own_cameras_px=off if np.isfinite(off) else None,
         points=len(points),
         point_distance=float(np.median(distances)) / scene.extent,
@@ -80,7 +75,7 @@ def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent
         first_pass=ran.first_pass,
         lost=ran.lost(),
         sure_px={views[file].name: px for file, px in sureness(model).items()},
-        auc=dict(zip("135", pose_auc(viewmats, own, len(views)), strict=True)),
+        **_compared(viewmats, own, scene.extent, len(views)),
     )
     return replace(
         scene,
@@ -101,5 +96,12 @@ def _content(view: View) -> bytes:
     return to_uint8(as_floats(view.image)).tobytes() + mask
 
 
-def _median_and_max(values: NDArray[np.float64]) -> dict[str, float]:
-    return {"median": float(np.median(values)), "max": float(values.max())}
+def _compared(found: Floats, own: Floats, extent: float, photos: int) -> dict[str, dict[str, float]]:
+    """How far poses are off the scene's own, world-to-camera matrices [V, 4, 4], of so many photos."""
+    degrees = np.rad2deg(rotation_angles(np.einsum("nij,nkj->nik", found[:, :3, :3], own[:, :3, :3])))
+    apart = np.linalg.norm(camera_centers(found) - camera_centers(own), axis=1) / extent
+    return {
+        "rotation_error_deg": {"median": float(np.median(degrees)), "max": float(degrees.max())},
+        "translation_error": {"median": float(np.median(apart)), "max": float(apart.max())},
+        "auc": dict(zip("135", pose_auc(found, own, photos), strict=True)),
+    }
