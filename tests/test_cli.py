@@ -460,7 +460,7 @@ def test_info_says_that_cameras_are_read(tmp_path: Path, capsys: pytest.CaptureF
     assert "are not read" not in told
     (tmp_path / "scene" / "transforms.json").rename(tmp_path / "scene" / "cameras.xml")
     assert call("info", tmp_path / "scene") == 0
-    assert "those in cameras.xml" in capsys.readouterr().out
+    assert "cameras.xml: not read" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("report", ["{}", "[1]", "{", '{"metrics": {"mean": 1, "views": [], "reasons": {}}}'])
