@@ -26,7 +26,7 @@ from hqgs.scene.georeference import georeference
 from hqgs.scene.load import load_scene
 from hqgs.scene.named_split import listed_split, names_by_any
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.failure import Outcome, why_doubtful, why_lost
+from hqgs.scene.sfm.failure import Outcome, why_doubtful
 from hqgs.scene.sfm.likely import likely_pairs
 from hqgs.scene.sfm.run import Model
 from hqgs.scene.sfm.triangulated import SparsePoints, triangulated
@@ -158,10 +158,6 @@ def test_the_pass_whose_model_it_is_is_told() -> None:
     tolerant = Outcome(True, 9, {"a": 500, "b": 500}, [], [], agree={"a": [40, 6, 5]})
     model = Model(None, [plain, tolerant], chosen=1)  # pyright: ignore[reportArgumentType]
     assert "of 40 points that should be visible, 6 are found" in why_doubtful(model.passes[model.chosen])
-    group = replace(plain, best={"a": [90, 80, 0]}, apart=[["a", "b", "c"]])
-    assert why_lost("a", group) == "it only matches 2 photos that have no pose either"
-    assert why_lost("a", group, {"b"}) == "it only matches one photo, which has no pose either"
-    assert why_lost("a", group, {"b", "c"}) == "it only matches photos that have no pose either"
 
 
 def test_photos_without_a_feature_have_no_likely_pairs(monkeypatch: pytest.MonkeyPatch) -> None:

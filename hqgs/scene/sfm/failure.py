@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -37,45 +38,49 @@ class Outcome:
     borne_out: float | None = None  # share of the inliers that the places of panoramas bear out
 
 
-def why_no_model(photos: int, passes: Sequence[Outcome]) -> str:
-    """Why no model could be started, with counts, and what to do; a sentence or two for the user."""
-    found = counts(photos, passes)
-    last = passes[-1]
-    told = f"COLMAP found no poses for these {photos} photos. {found}. "
-    if _is_poor(passes[0]):
-        return told + (
-            "So few features mean that photos are blurred or dark, or surfaces have no texture: take sharp "
-            "photos of things with texture"
-        )
-    if _pairs(last) == 0:
-        return told + (
-            "The photos have enough detail, but do not overlap. Take each photo so that two thirds of it "
-            "show what the next photo shows"
-        )
-    if photos < 10:
-        return told + "There are too few photos: take 20 to 100, a step apart, each overlapping the next"
-    return told + (
+class Check(NamedTuple):
+    """A cause that passes over so many photos show, and what to do about it."""
+
+    found: Callable[[int, Sequence[Outcome]], bool]
+    advice: str
+
+
+CHECKS = (  # the first that is found counts
+    Check(
+        lambda photos, passes: _usual(passes[0].features) < FEW_FEATURES,
+        "So few features mean that photos are blurred or dark, or surfaces have no texture: take sharp "
+        "photos of things with texture",
+    ),
+    Check(
+        lambda photos, passes: _pairs(passes[-1]) == 0,
+        "The photos have enough detail, but do not overlap. Take each photo so that two thirds of it show "
+        "what the next photo shows",
+    ),
+    Check(
+        lambda photos, passes: any(one.registered for one in passes),
+        "The other photos overlap too little with these: take more photos in between",
+    ),
+    Check(
+        lambda photos, passes: photos < 10,
+        "There are too few photos: take 20 to 100, a step apart, each overlapping the next",
+    ),
+    Check(
+        lambda photos, passes: True,
         "The photos overlap, but were taken from one place, or from places too far apart: walk around the "
-        "scene and take a photo at each step"
-    )
+        "scene and take a photo at each step",
+    ),
+)
 
 
 def why_few(photos: int, passes: Sequence[Outcome]) -> str:
-    """What to do where some photos have no place; one sentence with counts."""
-    first = passes[0]
-    poor = sorted(name for name, count in first.features.items() if count < FEW_FEATURES)
-    if _is_poor(first):
-        advice = "the photos are blurred or dark, or show no texture: take sharper ones"
-    elif poor and 2 * len(poor) >= photos - max(one.registered for one in passes):
-        advice = f"{len(poor)} photos have few features (blurred, dark, or surfaces without texture)"
-    else:
-        advice = "the other photos overlap too little with these: take more photos in between"
-    return f"{counts(photos, passes)}; {advice}"
+    """Why few of the photos have a place, or none, with counts, and what to do; a sentence or two."""
+    advice = next(check.advice for check in CHECKS if check.found(photos, passes))
+    return f"{counts(photos, passes)}. {advice}"
 
 
-def why_lost(name: str, one: Outcome, placed: Container[str] = ()) -> str:
-    """Why a pass found no place for a photo, in words with numbers; `placed`: those that have one by now."""
-    features, usual = one.features[name], float(np.median(list(one.features.values())))
+def why_lost(name: str, one: Outcome) -> str:
+    """Why a pass found no place for a photo, in words with numbers."""
+    features, usual = one.features[name], _usual(one.features)
     matches, inliers, with_placed = one.best[name]
     if features < max(FEW_FEATURES, POOR * usual):
         return f"blurred, dark or without texture: {features:,} features (median of all photos: {usual:,.0f})"
@@ -83,13 +88,6 @@ def why_lost(name: str, one: Outcome, placed: Container[str] = ()) -> str:
         return "it matches no other photo"
     if inliers < MATCHES:
         return f"{matches} matches with its best partner, of which only {inliers} fit one camera geometry"
-    group = next((group for group in one.apart if name in group), [])
-    if others := sum(other not in placed for other in group if other != name):
-        return (
-            f"it only matches {others} photos that have no pose either"
-            if others > 1
-            else "it only matches one photo, which has no pose either"
-        )
     if with_placed < MATCHES:
         return "it only matches photos that have no pose either"
     return f"too few matches ({with_placed}) with photos that have a pose"
@@ -153,9 +151,9 @@ def why_doubtful(one: Outcome, called: Callable[[str], str] = str) -> str:
 def counts(photos: int, passes: Sequence[Outcome]) -> str:
     """What was found, in numbers."""
     first, pairs = passes[0], photos * (photos - 1) // 2
-    features = list(first.features.values()) or [0]
+    fewest = min(first.features.values(), default=0)
     found = (
-        f"It found {int(np.median(features)):,} features per photo (median; fewest {min(features):,}), and "
+        f"It found {int(_usual(first.features)):,} features per photo (median; fewest {fewest:,}), and "
         f"{_pairs(first):,} of {pairs:,} pairs of photos match (most matches: {max([0, *first.inliers]):,})"
     )
     if len(passes) > 1:
@@ -163,8 +161,8 @@ def counts(photos: int, passes: Sequence[Outcome]) -> str:
     return found
 
 
-def _is_poor(one: Outcome) -> bool:
-    return float(np.median(list(one.features.values()) or [0])) < FEW_FEATURES
+def _usual(features: Mapping[str, int]) -> float:
+    return float(np.median([*features.values()] or [0]))
 
 
 def _pairs(one: Outcome) -> int:

@@ -26,16 +26,7 @@ from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
 from hqgs.scene.sfm import likely
 from hqgs.scene.sfm.database import LARGEST, LEAST_PHOTOS
-from hqgs.scene.sfm.failure import (
-    Outcome,
-    counts,
-    doubtful,
-    what_to_take,
-    why_doubtful,
-    why_few,
-    why_lost,
-    why_no_model,
-)
+from hqgs.scene.sfm.failure import Outcome, counts, doubtful, what_to_take, why_doubtful, why_few, why_lost
 from hqgs.scene.sfm.likely import MATCHED_ALL, PARTNERS
 
 AGAIN_SAID = {
@@ -102,7 +93,7 @@ class Model:
         """Photos that have no place, sorted, and why."""
         placed, one = registered(self.found), self._chosen
         rich = sorted(one.features, key=lambda name: one.features[name])  # of faces the last one tells
-        lost = {self._name(name): why_lost(name, one, placed) for name in rich if name not in placed}
+        lost = {self._name(name): why_lost(name, one) for name in rich if name not in placed}
         return dict(sorted(lost.items()))
 
     def advice(self) -> str | None:
@@ -225,7 +216,8 @@ def run_colmap(
         _run_program(directory, on_stage)
         facts = directory / "facts.json"
         if not (directory / "model" / "images.bin").is_file():
-            raise ValueError(why_no_model(len(names), _passes(facts)[0]))
+            told = why_few(len(names), _passes(facts)[0])
+            raise ValueError(f"COLMAP found no poses for these {len(names)} photos. {told}")
         if kept is not None:
             keep_folder(directory / "model", kept)
         return _read(directory / "model", called or {})
