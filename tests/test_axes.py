@@ -38,7 +38,7 @@ def test_axes_of_transforms_json(opencv: bool, tmp_path: Path) -> None:
     scene = hqgs.load(tmp_path, test_every=0)
     for view, truth in zip(scene.train, views(), strict=True):
         np.testing.assert_allclose(view.camera.viewmat, truth.camera.viewmat, atol=1e-9)
-    said = [note for note in scene.notes if "y and z are turned" in note]
+    said = [note for note in scene.notes if "y and z axes were flipped" in note]
     assert len(said) == opencv
 
 

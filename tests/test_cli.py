@@ -192,10 +192,10 @@ def test_what_lies_in_the_folder_of_a_new_run_is_named_or_kept(
         others = tmp_path / ("of " + name.replace("/", " "))
         (others / name).parent.mkdir(parents=True)
         (others / name).write_text("mine")
-        wanted = f"{others} holds {name.partition('/')[0]}, of no run, which a run would write over"
+        wanted = f"{others} holds {name.partition('/')[0]}, not of a run, which a run would overwrite"
         assert call("train", "embedded", "--out", others, "--iterations", "2") == 2
         assert wanted in one_line(capsys)
-        with pytest.raises(FileExistsError, match="would write over"):
+        with pytest.raises(FileExistsError, match="would overwrite"):
             hqgs.train(tiny_scene(), out=others, iterations=2)
         assert [path for path in others.rglob("*") if path.is_file()] == [others / name]
 

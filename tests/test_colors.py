@@ -326,7 +326,7 @@ def test_a_damaged_or_strange_profile_is_said(tmp_path: Path, icc: bytes) -> Non
     np.testing.assert_array_equal(scene.train[0].image, truth.photos[0])
     (note,) = [note for note in scene.notes if "profile" in note]
     assert note.startswith("2 of 5 photos are in a ")
-    assert "it is passed by, they count as sRGB: view_00.png, view_01.png" in note
+    assert "not converted, but read as sRGB: view_00.png, view_01.png" in note
 
 
 def test_a_high_dynamic_range_is_toned_down(tmp_path: Path) -> None:
@@ -351,7 +351,7 @@ def test_all_who_read_photos_get_srgb(tmp_path: Path) -> None:
         )
     scene = load_scene(tmp_path, test_every=0)
     assert np.abs(scene.train[0].image - np.array([40.0, 180, 60])).max() <= 2
-    assert "4 of 6 photos are in A camera: they are used as sRGB" in scene.notes
+    assert "4 of 6 photos are in A camera: they are converted to sRGB" in scene.notes
     found = bare_photos(tmp_path, 1)
     assert found is not None
     heard = list[str]()

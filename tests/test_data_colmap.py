@@ -88,7 +88,7 @@ def test_images_n_replaces_scaling(tmp_path: Path) -> None:
         np.testing.assert_array_equal(view.image, small[i])
         np.testing.assert_allclose(view.camera.K, np.diag([13 / 48, 9 / 36, 1]) @ truth.K)
     assert "images_4" in scene.notes[0]
-    assert "matched by sorted position" in scene.notes[1]
+    assert "photos were assigned in sorted order" in scene.notes[1]
     assert load_scene(tmp_path, downscale=3, test_every=0).train[0].camera.width == 16  # images, scaled
 
 
@@ -122,7 +122,7 @@ def test_points_that_are_not_finite_are_dropped(tmp_path: Path) -> None:
     scene = load_scene(tmp_path)
     np.testing.assert_array_equal(scene.points, np.delete(truth.points, first, 0))
     np.testing.assert_array_equal(scene.point_colors, np.delete(truth.colors, first, 0))
-    assert scene.notes == ["1 of 12 points are not finite and were dropped"]
+    assert scene.notes == ["1 of 12 points are NaN or Inf and were left out"]
 
 
 def test_missing_photos_are_left_out_and_named(tmp_path: Path) -> None:

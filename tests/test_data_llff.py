@@ -53,7 +53,7 @@ def test_images_n_and_scaling(tmp_path: Path) -> None:
     write_photos(replace(truth, photos=[p[::2, ::2] for p in truth.photos]), tmp_path / "images_2")
     scene = load_scene(tmp_path, downscale=2)
     np.testing.assert_array_equal(scene.train[0].image, truth.photos[1][::2, ::2])
-    assert scene.notes[0] == "photos were read from images_2, which holds them at downscale 2"
+    assert scene.notes[0] == "photos were read from images_2, which has them at downscale 2"
     scaled = load_scene(tmp_path, downscale=3)
     np.testing.assert_allclose(scaled.train[0].camera.K, np.diag([1 / 3, 1 / 3, 1]) @ CENTRED)
     assert not any("images_" in n for n in scaled.notes)
@@ -70,7 +70,7 @@ def test_colmap_model_wins_where_it_has_photos(tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.train[0].camera.viewmat, truth.viewmats[1], atol=1e-12)
     np.testing.assert_array_equal(scene.points, truth.points)
     assert scene.source == "colmap"
-    assert "cameras and points are both the COLMAP model's" in scene.notes[0]
+    assert "cameras and points are read from the COLMAP model" in scene.notes[0]
     (tmp_path / "sparse/0/images.bin").unlink()  # half a model is none
     assert load_scene(tmp_path).source == "llff"
 
@@ -182,7 +182,7 @@ def test_test_every(tmp_path: Path) -> None:
     assert len(load_scene(tmp_path, test_every=0).test) == 0
     with pytest.raises(ValueError, match="test_every must be at least 0, got -1"):
         load_scene(tmp_path, test_every=-1)
-    with pytest.raises(ValueError, match="all 9 views are test views"):
+    with pytest.raises(ValueError, match="all 9 photos are held out"):
         load_scene(tmp_path, test_every=1)
 
 

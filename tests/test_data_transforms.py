@@ -139,11 +139,11 @@ def test_file_path_outside_is_refused(tmp_path: Path, entry: str) -> None:
     write_photos(truth, tmp_path, ["outside.png"])
     path = entry.replace("{outside}", str(tmp_path / "outside.png"))
     write_transforms(truth, root, frames=[frames(truth)[0] | {"file_path": path}])
-    with pytest.raises(ValueError, match=r"leaves the folder|is no path"):
+    with pytest.raises(ValueError, match=r"leaves the folder|is no file"):
         load_scene(root, test_every=0)
     (root / "images/view_00.png").replace(root / "ok.png")
     write_transforms(truth, root, ply_file_path=path)
-    with pytest.raises(ValueError, match=r"leaves the folder|is no path"):
+    with pytest.raises(ValueError, match=r"leaves the folder|is no file"):
         load_scene(root, test_every=0)
 
 
@@ -180,7 +180,7 @@ def test_blender_set(tmp_path: Path) -> None:
     shown = (255.0 - alpha).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean((1, 3))
     np.testing.assert_allclose(small.empty, shown, atol=0.5)
     np.testing.assert_array_equal(resized(scene.train[0], WIDTH // 2, HEIGHT // 2).empty, small.empty)
-    assert any("the 6 photos are cut out" in note for note in scene.notes)
+    assert any("the 6 photos have transparent pixels" in note for note in scene.notes)
     assert "the test views are the 2 of transforms_test.json" in scene.notes[0]
     # The random points were drawn where the masks count, around the point all cameras look at.
     assert len(scene.points) == 20_000
@@ -344,7 +344,7 @@ def test_ply_without_colours_and_with_points_that_are_not_finite(tmp_path: Path)
     scene = load_scene(tmp_path)
     np.testing.assert_array_equal(scene.points, points[[0, 3]].astype(np.float32))
     np.testing.assert_array_equal(scene.point_colors, np.full((2, 3), 128))
-    assert scene.notes == ["2 of 4 points are not finite and were dropped"]
+    assert scene.notes == ["2 of 4 points are NaN or Inf and were left out"]
 
 
 HEADER = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\n{}end_header\n"

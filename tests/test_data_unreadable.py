@@ -48,7 +48,7 @@ def test_training_photos_are_skipped_and_named(
     told = 0 if longest is None else 1  # how many photos are scaled down: of those that can be opened
     assert scene.notes[told:-1] == whole.notes[told:]
     assert scene.notes[-1].startswith(
-        f"2 of 8 training photos cannot be used and were left out: view_03{suffix}, view_05{suffix}; of the "
+        f"2 of 8 training photos cannot be used and were left out: view_03{suffix}, view_05{suffix}. The "
         "first: cannot read the photo "
     )
     with pytest.raises(ValueError, match=rf"cannot read the photo .*view_03\{suffix}"):
@@ -89,7 +89,7 @@ def test_a_photo_of_another_shape_is_left_out(tmp_path: Path) -> None:
     Image.new("RGB", (30, 60)).save(tmp_path / "images/view_01.png")
     scene = load_scene(tmp_path, skip_unreadable=True)
     assert [view.name for view in scene.train] == ["view_02.png", "view_03.png"]
-    assert "view_01.png' is 30 x 60, but its camera is for 48 x 36: another shape" in scene.notes[-1]
+    assert "view_01.png' is 30 x 60, but its camera is for 48 x 36: another aspect ratio" in scene.notes[-1]
     with pytest.raises(ValueError, match=r"view_01\.png' is 30 x 60, but its camera is for"):
         load_scene(tmp_path)
 

@@ -187,7 +187,7 @@ def test_a_file_that_names_its_own_split(
 def test_a_split_that_contradicts_itself_is_refused(tmp_path: Path) -> None:
     names = [f"images/{name}" for name in make_truth(6).names]
     write_transforms(make_truth(6), tmp_path, train_filenames=names, test_filenames=names[:1])
-    with pytest.raises(ValueError, match=r"trained on and held out: images/view_00\.png"):
+    with pytest.raises(ValueError, match=r"training and held out: images/view_00\.png"):
         load_scene(tmp_path)
     write_transforms(make_truth(6), tmp_path, train_filenames=3)
     with pytest.raises(ValueError, match="train_filenames must be a list of names"):
@@ -217,7 +217,7 @@ def test_transforms_files_of_a_split(
     scene = load_scene(tmp_path)
     assert split_of(scene) == (train, test)
     kind = "test" if "test" in files else "val"
-    assert f"transforms_{kind}.json; test_every has no say" in "".join(scene.notes)
+    assert f"transforms_{kind}.json; test_every is not used" in "".join(scene.notes)
 
 
 @pytest.mark.parametrize(
@@ -234,7 +234,7 @@ def test_a_split_beside_a_model(tmp_path: Path, file: str, content: str) -> None
     (tmp_path / file).write_text(content, encoding="utf-8")
     scene = load_scene(tmp_path)
     assert split_of(scene) == ([0, 1, 3, 5], [2, 4])
-    assert not any("are no photo of the scene" in note for note in scene.notes)
+    assert not any("match no photo" in note for note in scene.notes)
     assert file in next(note for note in scene.notes if "split" in note)
 
 
@@ -346,4 +346,4 @@ def test_a_text_that_names_no_photo_is_no_split(tmp_path: Path, content: str) ->
     (tmp_path / "test.txt").write_text(content)
     scene = load_scene(tmp_path)
     assert split_of(scene) == split_of(own)
-    assert "test.txt names none of the photos: it is not taken for a split" in scene.notes
+    assert "test.txt names none of the photos, and is not used as a split" in scene.notes

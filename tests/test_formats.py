@@ -234,9 +234,9 @@ def change_gltf(path: Path, change: Any) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: c["nodes"][0].update(scale=[1, 0, 1]), "a map that is singular"),
-        (lambda c: c["nodes"][0].update(rotation=[0, 0, 0, "x"]), "a node has no map of space"),
-        (lambda c: c["nodes"][0].update(children=[0]), "no tree"),
+        (lambda c: c["nodes"][0].update(scale=[1, 0, 1]), "the transform is singular"),
+        (lambda c: c["nodes"][0].update(rotation=[0, 0, 0, "x"]), "a node has no valid transform"),
+        (lambda c: c["nodes"][0].update(children=[0]), "do not form a tree"),
         (lambda c: c["meshes"][0]["primitives"][0].pop("extensions"), "no primitive with KHR_gaussian"),
         (lambda c: c["accessors"][1].update(componentType=5122), "accessor 1 is not VEC4 of float32"),
         (lambda c: c["accessors"][0].update(count=10**12), "accessor 0 reaches beyond the data"),

@@ -136,9 +136,9 @@ def test_masks_are_looked_at_before_colmap_works(tmp_path: Path) -> None:
     for k in range(4):
         picture(k, (64, 48)).save(photos / f"{k}.png")
     Image.new("L", (48, 64), 255).save(photos / "masks" / "2.png")
-    with pytest.raises(ValueError, match=r"2\.png is 48 x 64, its photo 64 x 48: another shape"):
+    with pytest.raises(ValueError, match=r"2\.png is 48 x 64, its photo 64 x 48: another aspect ratio"):
         load_scene(photos, keep_sfm=tmp_path / "sfm", on_stage=heard.append)
-    assert {stage.what for stage in heard} == {"photos looked at"}
+    assert {stage.what for stage in heard} == {"photos read"}
     assert not (tmp_path / "sfm").exists()
 
 
@@ -148,11 +148,12 @@ def test_photos_without_a_mask_are_named_where_others_have_one(tmp_path: Path) -
     (tmp_path / "masks").mkdir()
     Image.new("L", (WIDTH, HEIGHT), 255).save(tmp_path / "masks" / "other.png")
     notes = load_scene(tmp_path).notes
-    assert "masks are in masks, but none of them has the name of a photo, and none is used" in notes
+    assert "masks are in masks, but are not used, as none has the name of a photo" in notes
     Image.new("L", (48, 36), 255).save(tmp_path / "masks" / truth.names[0])
     notes = load_scene(tmp_path).notes
     assert any(
-        note.startswith("1 of 4 photos have a mask, such as ") and "these have none, and count" in note
+        note.startswith("1 of 4 photos have a mask, such as ")
+        and "these have none, so all their pixels count" in note
         for note in notes
     )
 

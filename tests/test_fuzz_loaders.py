@@ -364,13 +364,13 @@ def test_no_path_in_a_file_leaves_the_folder(tmp_path: Path, path: str) -> None:
         meta = json.loads((root / "transforms.json").read_text())
         (meta if key == "ply_file_path" else meta["frames"][1])[key] = path
         (root / "transforms.json").write_text(json.dumps(meta))
-        with pytest.raises(ValueError, match=f"{key} .* (leaves the folder|is no path)"):
+        with pytest.raises(ValueError, match=f"{key} .* (leaves the folder|is no file)"):
             load_scene(root)
     degraded = tmp_path / "degraded"
     as_degraded(degraded)
     content = (degraded / "degradation.json").read_text()
     (degraded / "degradation.json").write_text(content.replace("low/a.png", json.dumps(path)[1:-1]))
-    with pytest.raises(ValueError, match=r"small photo .* (leaves the folder|is no path)"):
+    with pytest.raises(ValueError, match=r"small photo .* (leaves the folder|is no file)"):
         load_scene(degraded)
     colmap = tmp_path / "colmap"
     as_text(colmap)

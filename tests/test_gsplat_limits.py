@@ -54,6 +54,6 @@ def test_tile_lists_are_refused_by_name(packed: bool) -> None:
     _, _, meta, _ = shot(packed=packed)
     for name in ("isect_offsets", "flatten_ids", "tiles_per_gauss", "isect_ids"):
         assert name in (hqgs.rasterization.__doc__ or "")
-        with pytest.raises(KeyError, match=f"{name}: hqgs hands out no tile lists"):
+        with pytest.raises(KeyError, match=f"{name}: hqgs returns no tile lists"):
             meta[name]  # pyright: ignore
     assert meta.get("isect_offsets") is None

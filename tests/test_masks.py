@@ -171,9 +171,9 @@ def test_masks_of_photos_that_are_turned(
         assert view.mask is not None
         bright = view.image.mean(-1) > 100
         assert (view.mask == bright).mean() > 0.98
-    told = [note for note in scene.notes if "turned by EXIF" in note]
+    told = [note for note in scene.notes if "rotated by EXIF" in note]
     assert len(told) == (orientation > 1 and (orientation < 5 or size[0] == size[1]))
-    assert all("as edges in them say" in note for note in told)
+    assert all("as edges in the photos show" in note for note in told)
 
 
 def test_where_nothing_tells_how_masks_lie_that_is_said(tmp_path: Path) -> None:
@@ -183,7 +183,7 @@ def test_where_nothing_tells_how_masks_lie_that_is_said(tmp_path: Path) -> None:
     for name in truth.names:
         Image.new("RGB", (64, 48), "grey").save(tmp_path / "images" / name, exif=tags)
     scene = load_scene(tmp_path, test_every=0)
-    assert any("as they are stored, though nothing tells: look at them" in note for note in scene.notes)
+    assert any("as they are stored, though that is not certain: check them" in note for note in scene.notes)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

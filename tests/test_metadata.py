@@ -79,7 +79,7 @@ def test_srgb_colours_stay(tmp_path: Path, space: str | None) -> None:
     )
     read = hqgs.Gaussians.load(tmp_path / "a.glb")
     torch.testing.assert_close(read.sh0, g.sh0)
-    assert read.notes == ([] if space else ["it names no colour space: its colours were taken as sRGB"])
+    assert read.notes == ([] if space else ["it names no colour space: its colours were read as sRGB"])
 
 
 @pytest.mark.parametrize(
@@ -306,13 +306,13 @@ def test_up_of_other_programs(tmp_path: Path, comment: str, up: tuple[float, ...
     [
         ("units: m", 1.0, "its unit is a metre"),
         ("Length unit: metres", 1.0, "its unit is a metre"),
-        ("unit mm", None, "'unit mm', which is not heeded"),
-        ("Handedness: left", None, "'Handedness: left', which is not heeded"),
-        ("offset 500000 5200000 0", None, "which is not heeded"),
-        ("colorspace linear", None, "which is not heeded"),
-        ("SplatRenderMode: 2dgs", None, "which is not heeded"),
-        ("Vertical axis: north", None, "which is not heeded"),
-        ("EPSG:32632", None, "which is not heeded"),
+        ("unit mm", None, "'unit mm', which was ignored"),
+        ("Handedness: left", None, "'Handedness: left', which was ignored"),
+        ("offset 500000 5200000 0", None, "which was ignored"),
+        ("colorspace linear", None, "which was ignored"),
+        ("SplatRenderMode: 2dgs", None, "which was ignored"),
+        ("Vertical axis: north", None, "which was ignored"),
+        ("EPSG:32632", None, "which was ignored"),
     ],
 )
 def test_what_comments_say_is_heeded_or_said(

@@ -246,11 +246,11 @@ def test_what_a_network_says_of_tiles_counts(
 def test_networks_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = saved(tmp_path, BLOCKS)
     know_blocks(monkeypatch, purpose="FaceSR")
-    with pytest.raises(ValueError, match=r"net\.safetensors: Blocks \(FaceSR\) makes up detail"):
+    with pytest.raises(ValueError, match=r"net\.safetensors: Blocks \(FaceSR\) invents detail"):
         restore_scene(tiny_scene(), path)
     monkeypatch.setattr(hqgs.scene.restore, "RANDOM", ("Blocks",))
     know_blocks(monkeypatch)
-    with pytest.raises(ValueError, match=r"Blocks \(Restoration\) makes up detail"):
+    with pytest.raises(ValueError, match=r"Blocks \(Restoration\) invents detail"):
         restore_scene(tiny_scene(), path)
     monkeypatch.undo()
     know_blocks(monkeypatch, scale=2, purpose="SR")  # it says so, and does not do it

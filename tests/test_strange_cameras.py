@@ -204,10 +204,10 @@ def test_poses_of_nan_in_a_text_model(tmp_path: Path) -> None:
     ("change", "told"),
     [
         (values(cx=0.52, cy=0.48), "are shares of w, h = 48, 36: multiply fl_x, fl_y, cx and cy by them"),
-        (poses(lambda m: np.eye(4).tolist()), "all 9 photos have the same pose, so that it is none"),
+        (poses(lambda m: np.eye(4).tolist()), "all 9 photos have the same pose, which cannot be right"),
         (
             poses(lambda m: (np.diag([1, 1, -1, 1]) @ m).tolist()),
-            "the world is left-handed: negate one axis of it",
+            "the world is left-handed; negate one of its axes",
         ),
     ],
 )
@@ -222,7 +222,7 @@ def test_cameras_that_can_be_none_are_refused(change: Change, told: str, tmp_pat
     ("change", "told"),
     [
         (values(fl_x=FX * 100, fl_y=FY * 100, cx=2500, cy=1750), "9 of 9 cameras have their principal point"),
-        (poses(lambda m: np.linalg.inv(m).tolist()), "all 9 cameras stand in one place"),
+        (poses(lambda m: np.linalg.inv(m).tolist()), "all 9 cameras are at the same place"),
     ],
 )
 def test_cameras_that_are_odd_are_told(change: Change, told: str, tmp_path: Path) -> None:
@@ -308,5 +308,5 @@ def test_a_panorama_far_off_is_left_out_as_a_whole(spread: float, left: int, tmp
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
     scene = load_scene(tmp_path, test_every=0)
     assert len(scene.train) == left * 6
-    told = any(note.startswith("6 of 54 cameras lie far from all others") for note in scene.notes)
+    told = any(note.startswith("6 of 54 cameras are far from all others") for note in scene.notes)
     assert told == (left == 8)

@@ -109,8 +109,8 @@ def test_photos_that_are_in_a_cloud_alone_are_told(tmp_path: Path) -> None:
     (tmp_path / ".IMG_5.JPG.icloud").write_bytes(b"a name")
     (tmp_path / "b.jpg.crdownload").write_bytes(b"half")
     photos = looked_at(tmp_path)
-    assert photos.unreadable == {"0.png": "0 bytes: not downloaded from a cloud, or not copied to its end"}
-    told = ".IMG_5.JPG.icloud, b.jpg.crdownload: not here, or not to the end: download it first"
+    assert photos.unreadable == {"0.png": "0 bytes: its download or copy was not finished"}
+    told = ".IMG_5.JPG.icloud, b.jpg.crdownload: not fully downloaded: download it first"
     assert photos.notes == ["3 photos, no camera in EXIF", told]
 
 

@@ -82,7 +82,7 @@ def test_a_codebook_without_its_first_entry(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", ["sog", "splat"])
 def test_a_scene_without_a_finite_gaussian(tmp_path: Path, suffix: str) -> None:
     for scene in (some(0), some(3, means=torch.full((3, 3), float("nan")))):
-        with pytest.raises(ValueError, match=f"no Gaussian to write, and a .{suffix} file has one at least"):
+        with pytest.raises(ValueError, match=f"no Gaussian to write; a .{suffix} file needs at least one"):
             scene.save(tmp_path / f"a.{suffix}")
     assert not list(tmp_path.iterdir())
 

@@ -44,7 +44,7 @@ def test_a_file_is_read_by_what_it_holds(
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        (b"", "empty: its download did not succeed"),
+        (b"", "empty: the download failed"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 5\n", "a pointer of Git LFS"),
         (b"\n<!DOCTYPE html><html><body>404</body></html>", "a web page: download the file itself"),
         (gzip.compress(b"ply\nformat ascii 1.0\n", mtime=0), "one packed by gzip: unpack it"),
@@ -103,7 +103,7 @@ def test_points_alone_are_told(tmp_path: Path) -> None:
         3, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
     )
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "a.ply"))
-    with pytest.raises(ValueError, match="it holds points alone, of which `hqgs train` makes a scene"):
+    with pytest.raises(ValueError, match="it holds only points, from which `hqgs train` makes a scene"):
         Gaussians.load(tmp_path / "a.ply")
 
 

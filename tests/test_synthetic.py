@@ -245,7 +245,7 @@ def test_points_by_colmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         assert with_points(again) is again
     none = with_points(scene)
     assert none.points is scene.points
-    assert none.notes == [*guesses, "COLMAP finds no points for these cameras: it was asked again"]
+    assert none.notes == [*guesses, "COLMAP found no points for these cameras: it was asked again"]
     assert set(rows) == set(range(len(points)))
     assert len(rows) >= 3 * len(points)
     off = [depth_error([views[photo]], points[rows[photos == photo]]) for photo in range(5)]

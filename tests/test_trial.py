@@ -33,7 +33,7 @@ def facts(tried: Tried | None = None) -> Facts:
 
 
 def told(plan: RunPlan) -> str:
-    return next(row.evidence for row in plan.rows if row.what == "growth")
+    return next(row.evidence for row in plan.rows if row.what == "densification")
 
 
 @pytest.mark.parametrize(
@@ -46,9 +46,9 @@ def test_nothing_grows_where_photos_held_back_are_better_for_it(
     tried = Tried(gain, 0.4, photos=6, sure=sure)
     plan = plan_run(facts(tried), None, ASKED)
     densify = plan.settings.densify
-    assert (next(row.value for row in plan.rows if row.what == "growth") != "none") == grows
+    assert (next(row.value for row in plan.rows if row.what == "densification") != "none") == grows
     assert (densify.start < densify.stop) == grows
-    assert f"{gain:+.2f} ± 0.40 dB on 6 photos" in told(plan)
+    assert f"{gain:+.2f} ± 0.40 dB on 6 validation photos" in told(plan)
     long = plan_run(facts(tried), None, run_config(iterations=7000, method="hqgs", formation="none"))
     assert (long.settings.densify.reset_every < long.settings.densify.stop) == grows
     noisy = replace(ASKED, hqgs=replace(ASKED.hqgs, formation="noise:25"))  # which have a budget of their own

@@ -86,7 +86,7 @@ def test_up_as_it_was_asked_for(room: Scene) -> None:
     asked = as_asked(room, direction_of((0, 0, -2)))
     assert asked.world.up == (0, 0, -1)
     np.testing.assert_allclose(scene_up(asked), [0, 0, -1])
-    assert asked.notes[-1] == "up is (0.000, 0.000, -1.000), as it was asked for"
+    assert asked.notes[-1] == "up is (0.000, 0.000, -1.000), as given"
     for wrong in ((0, 0, 0), (1, 2), (math.nan, 0, 1)):
         with pytest.raises(ValueError, match=r"up is .*, wanted three numbers"):
             direction_of(wrong)

@@ -399,7 +399,7 @@ def test_text_comes_back(text: str) -> None:
     ("text", "message"),
     [
         ("shake:0.1", "shake is 0.1, wanted the longest extent of a shake in px, 0.5..200"),
-        ("exposure:9", "exposure is 9, wanted the most stops to either side, 0.01..4"),
+        ("exposure:9", "exposure is 9, wanted the largest deviation in stops, 0.01..4"),
         ("chat:7", "chat is 7, wanted the longest side in px, an integer in 8..10000"),
         ("phone:-1", "phone is -1, wanted stops of light that are missing, 0..12"),
         ("video:52", "video is 52, wanted a constant rate factor, an integer in 0..51"),
@@ -410,10 +410,10 @@ def test_text_comes_back(text: str) -> None:
         ("some:mixed", "got some:mixed"),
         ("some:fog", "got some:fog"),
         ("some:noise", "noise needs a value"),
-        ("some:noise:x", "'x' in the degradation 'some:noise:x' is no number"),
+        ("some:noise:x", "'x' in the degradation 'some:noise:x' is not a number"),
         ("some:jpeg:0", "jpeg is 0"),
-        ("focus", "focus goes by the depth of what a photo shows, .*; defocus:R blurs the whole photo"),
-        ("blur+grain", "grain says that each photo has noise of its own; some:noise:SIGMA makes such photos"),
+        ("focus", "focus depends on depths, .*; defocus:R blurs the whole photo"),
+        ("blur+grain", "grain means that each photo has its own noise; some:noise:SIGMA makes such photos"),
     ],
 )
 def test_bad_text_is_refused(text: str, message: str) -> None:
@@ -442,9 +442,11 @@ def test_a_factor_scales_within_the_range() -> None:
 @pytest.mark.parametrize("kind", [*NOT_TOLD, "some:blur", "some:shake", "blur+chat"])
 def test_a_method_cannot_be_told_of_these(kind: str) -> None:
     degradation = parse_degradation(kind)
-    with pytest.raises(ValueError, match="has no operator in the loss"):
+    with pytest.raises(ValueError, match="cannot be corrected in the loss"):
         parse_formation(kind)
-    with pytest.raises(ValueError, match="a formation is made of jpeg, noise, lowres, blur, defocus, motion"):
+    with pytest.raises(
+        ValueError, match="a formation consists of jpeg, noise, lowres, blur, defocus, motion"
+    ):
         formation(degradation, 40, 50)
     assert str(parse_formation("blur+jpeg:10")) == "blur+jpeg:10"
     assert {k for k, v in KINDS.items() if not v.formation} == {*NOT_TOLD}
@@ -454,5 +456,5 @@ def test_a_method_cannot_be_told_of_these(kind: str) -> None:
 def test_what_is_learned_takes_no_value(kind: str) -> None:
     assert str(parse_formation(f"{kind}+noise:5")) == f"{kind}+noise:5"
     assert formation(parse_formation(kind), 40, 50) is None
-    with pytest.raises(ValueError, match=f"each photo has its own of it, which is found; write {kind}"):
+    with pytest.raises(ValueError, match=f"it is measured for each photo; write {kind}"):
         parse_formation(f"{kind}:2")

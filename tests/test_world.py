@@ -79,7 +79,7 @@ def test_pictures_are_the_same_in_any_unit_and_place(tmp_path: Path, scale: floa
     assert wanted.max() > 0.05
     scene = load(placed(truth, scale, np.full(3, away), seed=1), tmp_path / "other")
     assert same(pictures(scene), wanted, kept(scale, away))
-    assert any("goes back to the frame of the files" in note for note in scene.notes)
+    assert any("written in the frame of the input" in note for note in scene.notes)
 
 
 def test_a_hundred_random_similarities(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_a_camera_far_off_is_left_out_and_named(tmp_path: Path, axis: int, away:
     scene = load(replace(truth, viewmats=viewmats), tmp_path)
     names = [name for name in truth.names if name != "view_04.png"]
     assert [view.name for view in scene.train] == names
-    assert any("1 of 9 cameras lie far" in note and "view_04.png" in note for note in scene.notes)
+    assert any("1 of 9 cameras are far" in note and "view_04.png" in note for note in scene.notes)
     own = load(truth, tmp_path / "own")
     assert scene.extent == pytest.approx(own.extent, rel=0.1)
     assert scene.reach == pytest.approx(own.reach, rel=0.1)

@@ -57,7 +57,7 @@ class Meta(dict[str, Any]):
 
     def __missing__(self, key: str) -> Any:
         if key in _TILE_LISTS:
-            raise KeyError(f"{key}: hqgs hands out no tile lists")
+            raise KeyError(f"{key}: hqgs returns no tile lists")
         raise KeyError(key)
 
     def __getitem__(self, key: str) -> Any:

@@ -29,7 +29,7 @@ _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b
 _registering = Lock()
 _LOSSY = ("JPEG", "MPO", "HEIF", "JPEG2000", "AVIF")  # formats that change values around an edge
 GRID = 32  # cells of a glance's small picture, each way
-_FLOATS = "floating-point pixels have no agreed white: save it with 8 or 16 bits"
+_FLOATS = "pixels are floating-point, of which the white level is unknown: save it with 8 or 16 bits"
 _NOT_RGB = ("P", "CMYK", "LAB", "YCbCr", "HSV")  # modes whose channels are no brightness
 _HALF = 128  # of 8 bits: from here on a pixel of a lossy mask counts
 
@@ -100,7 +100,7 @@ def glance(path: Path) -> Glance:
     """Look at a photo that can be decoded to its end. UnreadableError: it cannot."""
     try:
         if not path.stat().st_size:
-            raise UnreadableError("0 bytes: not downloaded from a cloud, or not copied to its end")
+            raise UnreadableError("0 bytes: its download or copy was not finished")
         with open_photo(path) as photo:
             if photo.mode == "F":
                 raise UnreadableError(_FLOATS)
@@ -236,7 +236,7 @@ def is_shown(path: Path, width: int, height: int, orientation: int = 1) -> bool 
     stored = abs(w * height - h * width) <= width + height
     shown = abs(w * width - h * height) <= width + height if orientation >= 5 else stored
     if not (stored or shown):
-        raise ValueError(f"the mask {path} is {w} x {h}, its photo {width} x {height}: another shape")
+        raise ValueError(f"the mask {path} is {w} x {h}, its photo {width} x {height}: another aspect ratio")
     return None if stored and shown and orientation > 1 else not stored
 
 

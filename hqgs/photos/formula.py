@@ -35,7 +35,7 @@ KINDS = {
     "motion": Kind(1, 200, "a length in px", "LENGTH", at_504=15.0),
     "shake": Kind(0.5, 200, "the longest extent of a shake in px", "PX", at_504=12.0, own="photo"),
     "focus": Kind(0, math.inf, "no value", default=0, some=False, own="photo"),
-    "exposure": Kind(0.01, 4, "the most stops to either side", "EV", default=1, own="photo"),
+    "exposure": Kind(0.01, 4, "the largest deviation in stops", "EV", default=1, own="photo"),
     "vignetting": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
     "response": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
     "grain": Kind(0, math.inf, "no value", default=0, some=False, own="found"),
@@ -51,10 +51,9 @@ LINEAR = frozenset({"blur", "defocus", "motion", "lowres"})  # they take fine de
 ERRORS = frozenset({"noise", "jpeg"})  # all photos show what is not there
 FILM = frozenset({"video"})  # the kinds of a film of which its codec alone is told
 NOT_MADE = {
-    "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; "
-    "defocus:R blurs the whole photo",
-    **dict.fromkeys(DEVICES, "it is of each camera, and photos do not tell which one took them"),
-    "grain": "grain says that each photo has noise of its own; some:noise:SIGMA makes such photos",
+    "focus": "focus depends on depths, which a photo does not show; defocus:R blurs the whole photo",
+    **dict.fromkeys(DEVICES, "it belongs to a camera, and which camera took a photo is unknown"),
+    "grain": "grain means that each photo has its own noise; some:noise:SIGMA makes such photos",
     **dict.fromkeys(("shake", "exposure", "video"), "hqgs undoes it; only its benchmarks make such photos"),
 }  # what a method can be told of only, and what to write for photos
 
@@ -188,9 +187,9 @@ def check_formation(degradation: Degradation) -> Degradation:
     for step in degradation.steps:
         if step.some or not KINDS[step.kind].formation:
             known = ", ".join(name for name, kind in KINDS.items() if kind.formation)
-            raise ValueError(f"{step} has no operator in the loss; a formation is made of {known}")
+            raise ValueError(f"{step} cannot be corrected in the loss; a formation consists of {known}")
         if step.kind in OWN and step.value is not None:
-            raise ValueError(f"{step}: each photo has its own of it, which is found; write {step.kind}")
+            raise ValueError(f"{step}: it is measured for each photo; write {step.kind}")
     return degradation
 
 
@@ -202,7 +201,7 @@ def _parsed(text: str) -> Degradation:
         if part == MIXED:
             steps.extend(MIXED_STEPS)
         elif part == NONE:
-            raise ValueError(f"{NONE!r} stands alone, got the degradation {text!r}")
+            raise ValueError(f"{NONE!r} cannot be joined with others, got the degradation {text!r}")
         else:
             some = part.partition(":")[0] == SOME
             kind, colon, value = (part.partition(":")[2] if some else part).partition(":")
@@ -226,7 +225,7 @@ def _number(text: str, part: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{text!r} in the degradation {part!r} is no number")
+        raise ValueError(f"{text!r} in the degradation {part!r} is not a number")
     return value
 
 

@@ -163,7 +163,7 @@ def told(found: Mapping[str, Colors | None]) -> list[str]:
             named.setdefault((colors.name, colors.known), []).append(name)
     return [
         f"{len(names)} of {len(found)} photos are in {colors}: "
-        + ("they are used as sRGB" if known else f"it is passed by, they count as sRGB: {some(names)}")
+        + ("they are converted to sRGB" if known else f"not converted, but read as sRGB: {some(names)}")
         for (colors, known), names in named.items()
     ]
 

@@ -38,8 +38,8 @@ def with_true_axes(views: Sequence[View]) -> tuple[list[View], str | None]:
     if turned < AXES_FEWEST or turned < AXES_CLEAR * stated:
         return list(views), None
     note = (
-        f"the cameras' y and z are turned: {turned} of {matches} matches between photos fit then, {stated} "
-        "as the file has them (it holds OpenCV's axes where its format has OpenGL's)"
+        f"the cameras' y and z axes were flipped: {turned} of {matches} matches between photos then fit, "
+        f"{stated} without (the file has OpenCV's axes; its format wants OpenGL's)"
     )
     return [
         replace(view, camera=replace(view.camera, viewmat=TURNED @ view.camera.viewmat)) for view in views

@@ -119,7 +119,7 @@ def load_cameras(folder: str | Path) -> RunCameras:
         views = [_known(path, folder, entry, world) for entry in value["views"]]
         background = tuple(float(channel) for channel in value.get("background", BACKGROUND))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path}: no cameras of a run: {error!r}") from error
+        raise ValueError(f"{path}does not hold the cameras of a run: {error!r}") from error
     if len(background) != 3 or not np.isfinite(background).all():
         raise ValueError(f"{path}: background is no colour: {value['background']!r:.60}")
     if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
@@ -143,7 +143,7 @@ def picked(train: Sequence[N], test: Sequence[N], which: str, whose: str) -> lis
     kinds = {"train": train, "test": test, "all": sorted([*train, *test], key=lambda one: one.name)}
     if which in kinds:
         if not kinds[which]:
-            raise ValueError(f"--views {which}: {whose} has none of them")
+            raise ValueError(f"--views {which}: {whose} has no such photo")
         return [*kinds[which]]
     named = {one.name: one for one in kinds["all"]}
     named |= {Path(name).stem: one for name, one in named.items() if Path(name).stem not in named}
@@ -196,7 +196,7 @@ def moved(camera: Camera, world: World, by: NDArray[np.float64] | None = None) -
         size = np.linalg.norm(by[0, :3])
         turn = by[:3, :3] / size
         if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
-            raise ValueError("the scene's file stretches or mirrors it, where no camera can follow")
+            raise ValueError("the scene file stretches or mirrors the scene, which cameras cannot follow")
         viewmat = view_matrix(viewmat[:3, :3] @ turn.T, by[:3, :3] @ camera.center + by[:3, 3])
     return replace(camera, viewmat=world.viewmat_into(viewmat))
 
@@ -261,14 +261,14 @@ def load_path(path: str | Path) -> tuple[list[Camera], float]:
         frames = value["camera_path"]
         for one in (value, *frames):
             if (kind := one.get("camera_type", "perspective")) != "perspective":
-                raise ValueError(f"camera_type is {kind!r}, drawn here are perspective cameras alone")
+                raise ValueError(f"camera_type is {kind!r}, only perspective cameras can be rendered")
         if not 0 < len(frames) <= MOST_FRAMES:
             raise ValueError(f"{len(frames)} frames")
         if not 0 < fps <= 1000:
             raise ValueError(f"fps is {fps}")
         cameras = [_frame(frame, width, height) for frame in frames]
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise ValueError(f"{path}: no camera path: {error!r}") from error
+        raise ValueError(f"{path}is no camera path: {error!r}") from error
     return cameras, fps
 
 

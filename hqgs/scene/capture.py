@@ -70,7 +70,7 @@ def keep_finite(
     with np.errstate(over="ignore"):
         finite = np.isfinite(points.astype(np.float32)).all(1)
     if not finite.all():
-        notes.append(f"{int((~finite).sum())} of {len(points)} points are not finite and were dropped")
+        notes.append(f"{int((~finite).sum())} of {len(points)} points are NaN or Inf and were left out")
     return points[finite], colors[finite]
 
 
@@ -93,7 +93,7 @@ def viewmat_from_pose(pose: NDArray[np.float64], name: str, *, camera_to_world: 
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > 1e-2 or size < 0:
         mirrored = (
-            ", but mirrors: the frame of its camera or of the world is left-handed: negate one axis of it"
+            ", it mirrors: the frame of its camera or of the world is left-handed; negate one of its axes"
             if size < 0
             else ""
         )
@@ -122,7 +122,7 @@ def inside(root: Path, name: str, what: str) -> Path:
     it resolves to only where that is outside.
     """
     if "\0" in name:
-        raise ValueError(f"{what} {name!r} is no path in {root}")
+        raise ValueError(f"{what} {name!r} is no file in {root}")
     path = Path(os.path.normpath(root / name))
     if not path.is_relative_to(root):
         path = path.resolve()
@@ -182,7 +182,7 @@ def photo_folder(root: Path, downscale: float) -> tuple[Path, float, list[str]] 
         return (
             ready,
             1.0,
-            [f"photos were read from {ready.name}, which holds them at downscale {downscale:g}"],
+            [f"photos were read from {ready.name}, which has them at downscale {downscale:g}"],
         )
     spelt = [p for p in (sorted(root.iterdir()) if root.is_dir() else []) if p.name.lower() == "images"]
     for folder in (root / "images", root / "images_1", *spelt):
@@ -194,7 +194,7 @@ def photo_folder(root: Path, downscale: float) -> tuple[Path, float, list[str]] 
 def perhaps(root: Path) -> str:
     """The folder above that has photos, where one inside of a scene was given, as advice; or nothing."""
     meant = next((folder for folder in [*root.absolute().parents][:2] if photo_folder(folder, 1.0)), None)
-    return "" if meant is None else f"; perhaps {meant} is meant"
+    return "" if meant is None else f"; did you mean {meant}?"
 
 
 def check_camera(camera: pycolmap.Camera, name: str) -> None:
@@ -220,7 +220,7 @@ def check_size(camera: pycolmap.Camera, width: int, height: int, name: str) -> N
     if not fits(camera, width, height):
         raise MisfitError(
             f"photo {name!r} is {width} x {height}, but its camera is for {camera.width} x {camera.height}: "
-            "another shape (was the photo rotated or cropped after the cameras were computed?)"
+            "another aspect ratio (was the photo rotated or cropped after the cameras were computed?)"
         )
 
 

@@ -30,10 +30,10 @@ def _ending(suffixes: tuple[str, ...]) -> re.Pattern[str]:
 
 
 BESIDE = (  # photos
-    Check(_ending(FILM_SUFFIXES), "not read beside photos; give a film in place of the folder to use it"),
+    Check(_ending(FILM_SUFFIXES), "not read beside photos; to use a film, give it instead of the folder"),
     Check(
         _ending((".icloud", ".crdownload", ".part", ".partial", ".download")),
-        "not here, or not to the end: download it first",
+        "not fully downloaded: download it first",
     ),
     Check(
         re.compile(
@@ -41,13 +41,13 @@ BESIDE = (  # photos
             r".*\.(xml|csv|out|json|txt|log|bin|np[yz])|.*\.(psx|rcproj|nvm|mg)",
             re.IGNORECASE,
         ),
-        "not read: cameras are found from the photos; an export for COLMAP or nerfstudio is read",
+        "not read; hqgs finds the cameras from the photos instead. Exports for COLMAP or nerfstudio are read",
     ),
 )
 IN_PLACE = (  # of photos
-    Check(_ending(RAW_SUFFIXES), "raw data of a camera: develop them to JPEG, all with the same settings"),
+    Check(_ending(RAW_SUFFIXES), "raw photos: develop them to JPEG, all with the same settings"),
     Check(_ending(ARCHIVE_SUFFIXES), "unpack it, and give the folder with the photos"),
-    Check(_ending(FILM_SUFFIXES), "several films: give one of them in place of the folder"),
+    Check(_ending(FILM_SUFFIXES), "several films: give one of them instead of the folder"),
 )
 
 
@@ -75,7 +75,7 @@ def elsewhere(root: Path) -> list[str]:
 def broken(root: Path) -> str | None:
     """What is there of a scene that is not whole; None: nothing."""
     if (folder := half_model(root)) is not None:
-        return f"{folder} holds half a COLMAP model: cameras, images and points3D are wanted, as .bin or .txt"
+        return f"{folder} holds a part of a COLMAP model: wanted cameras, images, points3D, as .bin or .txt"
     names = [name for name in CAMERAS if (root / name).exists()]
     return f"{root / names[0]} is no file" if names else None
 

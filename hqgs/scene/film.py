@@ -73,14 +73,14 @@ def film_frames(
     note = f"the sharpest {frames} frames of {as_text(path.name)}, one for each interval"
     if told := _written(target).get("told"):
         note = "; ".join([note, *told])
-        on_stage(Stage("frames of the film looked at", frames, frames, note))
+        on_stage(Stage("frames of the film read", frames, frames, note))
     return target, note
 
 
 def check_film(path: str | Path) -> None:
     """ValueError where a number of frames is asked of something else than a film."""
     if is_room(path) or (Path(path).is_dir() and film_at(path) is None):
-        raise ValueError(f"frames is for films, and {path} is none: each of its photos is used")
+        raise ValueError(f"frames is for films, and {path} is not a film: all of its photos are used")
 
 
 def _is_around(path: Path) -> bool:
@@ -168,13 +168,13 @@ def _sharpest(
                 sharpness = -1.0 if frame.is_corrupt else _sharpness(frame)
                 if sharpness > best_sharpness:
                     best_sharpness, best = sharpness, (number, frame)
-                on_stage(Stage("frames of the film looked at", number + 1, stream.frames or 0))
+                on_stage(Stage("frames of the film read", number + 1, stream.frames or 0))
     except (av.error.FFmpegError, OSError) as error:
         known = error.errno is not None and error.errno in errno.errorcode  # FFmpeg has numbers of its own
         why = os.strerror(error.errno or 0) if known else "it is no film, or damaged"
         if best is None:
             raise ValueError(f"the film {path} cannot be read: {why}") from error
-        told[f"what comes after frame {best[0]} cannot be read ({why})"] = None
+        told[f"frames after number {best[0]} cannot be read ({why})"] = None
     if best is None:
         raise ValueError(f"the film {path} holds no frame that can be read")
     yield best[0], _shown(best[1], curve, wide, told)
@@ -198,7 +198,7 @@ def _best_stream(film: Any, path: Path, told: dict[str, None]) -> Any:
         ranks.append((not flags & aside, not few, stream.width * stream.height, flags & 1))
     best = streams[max(range(len(ranks)), key=lambda k: (ranks[k], -k))]
     if len(streams) > 1:
-        told[f"of its {len(streams)} streams of pictures, that of {best.width} x {best.height} px"] = None
+        told[f"of its {len(streams)} streams of pictures, the one of {best.width} x {best.height} px"] = None
     return best
 
 
@@ -213,7 +213,7 @@ def _decoded(av: Any, film: Any, stream: Any, told: dict[str, None]) -> Iterator
             continue
         yield from frames
     if lost:
-        told[f"{lost} damaged pieces of it were left out"] = None
+        told[f"{lost} damaged parts were left out"] = None
 
 
 def _progressive(av: Any, frames: Iterator[Any], told: dict[str, None]) -> Iterator[tuple[float | None, Any]]:
@@ -253,7 +253,7 @@ def _shown(frame: Any, curve: int, wide: Fraction | None, told: dict[str, None])
     """
     photo = as_photo(frame, curve)
     if (colors := film_colors(frame, curve)) is not None:
-        text = f"its colours, {colors.name}, became sRGB"
+        text = f"its colours, {colors.name}, were converted to sRGB"
         if colors.hdr != (0, 0):
             text += f": light above {KNEE:g} of the reference white of 203 cd/m2 is bent to end at white"
         told[text] = None
@@ -266,7 +266,7 @@ def _shown(frame: Any, curve: int, wide: Fraction | None, told: dict[str, None])
     across = abs(a) + abs(d) < abs(b) + abs(c)
     x, y = (c, b) if across else (a, d)
     if x * y * (-1 if across else 1) < 0:
-        told["mirrored, as it asks players to show it"] = None
+        told["mirrored, as the file says"] = None
     photo = photo.swapaxes(0, 1) if across else photo
     return np.ascontiguousarray(photo[:: -1 if y < 0 else 1, :: -1 if x < 0 else 1])
 

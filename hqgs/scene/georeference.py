@@ -49,8 +49,8 @@ class Georeference:
         sure = "" if self.tilt is None else f", 95 % of it within {self.tilt:.2g} degrees"
         return (
             f"GPS of {self.used} of {self.photos} photos: a unit is {self.scale:.4g} m (95 % interval "
-            f"{lower:.4g} to {upper:.4g}), up is ({up}){sure}, the origin lies at {place}; places are "
-            f"{self.residual:.2g} m off (they spread over {self.spread:.3g} m)"
+            f"{lower:.4g} to {upper:.4g}), up is ({up}){sure}, the origin is at {place}; GPS "
+            f"positions are off by {self.residual:.2g} m (they spread over {self.spread:.3g} m)"
         )
 
 

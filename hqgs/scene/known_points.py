@@ -28,7 +28,7 @@ def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = sile
     sides = [min(view.camera.width, view.camera.height) for view in views]
     if not scene.guessed or len(views) < 2 or min(sides) < TOO_SMALL:
         return scene
-    on_stage(Stage("COLMAP: points for the cameras that are there", 0, 0))
+    on_stage(Stage("COLMAP: points for the given cameras", 0, 0))
     file = None if keep is None else keep / f"points-{key_of('points', _pieces(scene))}.npz"
     if file is not None and file.is_file():
         with np.load(file, allow_pickle=False) as data:
@@ -43,7 +43,7 @@ def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = sile
             with atomic_path(file) as tmp, tmp.open("wb") as out:
                 np.savez(out, **found._asdict())
     if isinstance(found, str):
-        return replace(scene, notes=[*scene.notes, f"COLMAP finds no points for these cameras: {found}"])
+        return replace(scene, notes=[*scene.notes, f"COLMAP found no points for these cameras: {found}"])
     notes = [note for note in scene.notes if not note.startswith(NO_POINTS)]
     seen = {view.name: np.unique(found.rows[found.photos == k]) for k, view in enumerate(views)}
     return replace(

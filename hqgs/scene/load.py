@@ -103,7 +103,7 @@ def load_scene(
     views, unreadable = load_views(capture.photos, capture.downscale, optional, on_stage, over)
     if any(view.empty is not None for view in views):
         notes.append(
-            f"the {len(views)} photos are cut out: what is transparent is black, in photos and renders"
+            f"the {len(views)} photos have transparent pixels, which are black in photos and renders"
         )
     if degraded is not None and downscale == 1:
         views = _with_lows(views, degraded, root, optional, unreadable)
@@ -113,7 +113,7 @@ def load_scene(
     train = [v for v in views if v.name not in test_names]
     test = [v for v in views if v.name in test_names]
     if not names - test_names:
-        raise ValueError(f"{root}: all {len(views)} views are test views, none is left to train on")
+        raise ValueError(f"{root}: all {len(views)} photos are held out, none is left to train on")
     for kept, those, what in (
         (train, names - test_names, "training"),
         (test, names & test_names, "held-out"),
@@ -124,7 +124,7 @@ def load_scene(
         if gone:
             notes.append(
                 f"{len(gone)} of {len(those)} {what} photos cannot be used and were left out: "
-                f"{some(sorted(gone))}; of the first: {gone[min(gone)]}"
+                f"{some(sorted(gone))}. The first: {gone[min(gone)]}"
             )
     points, colors = capture.points.astype(np.float64), capture.point_colors
     guessed = len(points) == 0
@@ -236,9 +236,7 @@ def _read(root: Path, downscale: float, sfm: bool, search: Search) -> Capture:
     if COLMAP in formats:
         capture = read_colmap(root, downscale)
         if others:
-            note = (
-                f"cameras and points are both the COLMAP model's, in its frame; not read: {', '.join(others)}"
-            )
+            note = f"cameras and points are read from the COLMAP model; not read: {', '.join(others)}"
             capture = replace(capture, notes=[*capture.notes, note])
         return capture
     if SINGLE in others or TRAIN in others:
@@ -246,7 +244,7 @@ def _read(root: Path, downscale: float, sfm: bool, search: Search) -> Capture:
     if POSES in others:
         return read_llff(root, downscale)
     if not sfm and (half := broken(root)) is not None:
-        raise ValueError(f"{half}; `--sfm` takes cameras and points from the photos alone")
+        raise ValueError(f"{half}; `--sfm` finds cameras and points from the photos instead")
     if (photos := bare_photos(root, downscale)) is not None:
         told = [] if sfm else elsewhere(root)
         if told:
@@ -276,7 +274,7 @@ def bounded(capture: Capture, longest: int) -> Capture:
     up_to, count = "" if len(set(sizes)) == 1 else "up to ", len(sizes)
     note = (
         f"{count} photos of {up_to}{largest[0]} x {largest[1]} px are used at {up_to}{width} x {height} px "
-        f"(sides divided by {downscale:.3g}{then}); `--downscale 1` takes their full size, and far longer"
+        f"(sides divided by {downscale:.3g}{then}); `--downscale 1` uses full size and takes far longer"
     )
     if downscale > max(max(largest) / longest, capture.downscale):
         note += (

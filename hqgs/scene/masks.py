@@ -67,10 +67,10 @@ def told(root: Path, capture: Capture) -> list[str]:
     masks = [photo.mask_path.name for photo in capture.photos if photo.mask_path is not None]
     if masks:
         which = f"{len(masks)} of {len(capture.photos)} photos have a mask, such as {masks[0]}"
-        return [which + (f"; these have none, and count everywhere: {some(bare)}" if bare else "")]
+        return [which + (f"; these have none, so all their pixels count: {some(bare)}" if bare else "")]
     for place in (root, capture.folder or root):
         if found := [p.name for p in place.iterdir() if p.is_dir() and is_mask_folder(p.name)]:
-            return [f"masks are in {found[0]}, but none of them has the name of a photo, and none is used"]
+            return [f"masks are in {found[0]}, but are not used, as none has the name of a photo"]
     return []
 
 
@@ -90,7 +90,7 @@ def with_turns(photos: list[Photo], notes: list[str]) -> list[Photo]:
     if not turned or len(known) == len(turned):
         return photos
     if known:
-        shown, why = 2 * sum(known) >= len(known), "as those of other shape are"
+        shown, why = 2 * sum(known) >= len(known), "as masks of other photos are"
     else:
         asked = [turned[k] for k in evenly(len(turned), _ASKED)]
         ratios = [
@@ -99,12 +99,12 @@ def with_turns(photos: list[Photo], notes: list[str]) -> list[Photo]:
         ratio = float(np.exp(np.mean(np.log(ratios)))) if ratios else 1.0
         shown = ratio > _CLEARER
         why = (
-            "as edges in them say"
+            "as edges in the photos show"
             if max(ratio, 1 / ratio) > _CLEARER
-            else "though nothing tells: look at them"
+            else "though that is not certain: check them"
         )
     notes.append(
-        f"{len(turned)} photos are turned by EXIF: their masks are taken for those of photos "
+        f"{len(turned)} photos are rotated by EXIF: their masks are used as masks of photos "
         f"{'shown upright' if shown else 'as they are stored'}, {why}"
     )
     return [replace(photo, mask_shown=shown) if photo.name in shapes else photo for photo in photos]

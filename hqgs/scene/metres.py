@@ -29,7 +29,7 @@ def distance_of(value: Sequence[str | float]) -> Distance:
             f"distance takes two photos' names, or points x,y,z, and metres, got {list(value)}"
         ) from error
     if a == b:
-        raise ValueError(f"distance: both photos are {a!r}; name two whose cameras stood apart")
+        raise ValueError(f"distance: both photos are {a!r}; name two photos taken at different places")
     if not 0 < length < math.inf:
         raise ValueError(f"distance: {length:g} m between {a} and {b}; it must be more than 0")
     return a, b, length

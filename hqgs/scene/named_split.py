@@ -83,19 +83,19 @@ def held_out(
     held = test if kind == TEST else val if kind == VAL else set(names) - train
     chosen = train if split.train else set(names) - held - val
     if both := sorted(chosen & held):
-        raise ValueError(f"{split.source}: photos are to be trained on and held out: {some(both)}")
+        raise ValueError(f"{split.source}: photos are in both lists, training and held out: {some(both)}")
     if not chosen:
         raise ValueError(f"{split.source} names none of the photos to train on")
     if not held and kind != TRAIN:
         raise ValueError(f"{split.source} names none of the photos to hold out")
     rest = sorted(set(names) - chosen - held)
-    rule = f"the split is that of {split.source}: {len(chosen)} photos to train on, {len(held)} held out"
-    notes.append(f"{rule}; test_every has no say")
+    rule = f"split by {split.source}: {len(chosen)} photos to train on, {len(held)} held out"
+    notes.append(f"{rule}; test_every is not used")
     if rest:
-        notes.append(f"{len(rest)} photos are in no list of {split.source} that counts: {some(rest)}")
+        notes.append(f"{len(rest)} photos are in no list of {split.source} and are not used: {some(rest)}")
     listed = [*(split.train or []), *(split.test or []), *(split.val or [])]
     if missing := [name for name in listed if _photo(name, known) is None]:
-        notes.append(f"{len(missing)} names in {split.source} are no photo of the scene: {some(missing)}")
+        notes.append(f"{len(missing)} names in {split.source} match no photo: {some(missing)}")
     return frozenset(chosen), frozenset(held)
 
 

@@ -17,7 +17,7 @@ def existing_folder(path: str | Path) -> Path:
     """The folder of a scene, resolved. FileNotFoundError where there is none, ValueError for a file, or where
     nothing is in it."""
     if "://" in str(path) or str(path).startswith(("http:/", "https:/")):
-        raise ValueError(f"{path} is an address: download what it names, and give that folder or film")
+        raise ValueError(f"{path} is a web address: download it, and give the folder or film")
     folder = Path(path).expanduser().resolve()
     if not folder.exists():
         near = ""
@@ -35,9 +35,11 @@ def existing_folder(path: str | Path) -> Path:
     if folder.name.lower().endswith(ARCHIVE_SUFFIXES):
         raise ValueError(f"{folder} is an archive: unpack it, and give the folder with the photos")
     if folder.name.lower().endswith(SCENE_SUFFIXES):
-        raise ValueError(f"{folder} is a scene file, trained already: hqgs view shows it; photos are wanted")
+        raise ValueError(
+            f"{folder} is a trained scene file, which hqgs view shows; wanted a folder with photos"
+        )
     raise ValueError(
-        f"{folder} is a file, a scene is a folder with photos, or a film: perhaps {folder.parent} is meant"
+        f"{folder} is a file; wanted a folder with photos, or a film: did you mean {folder.parent}?"
     )
 
 

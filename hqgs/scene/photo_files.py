@@ -91,7 +91,7 @@ def strangers(out: Path) -> list[str]:
     taken = [name for name in names if name in RUN_FILES or name in held]
     if taken:
         raise FileExistsError(
-            f"{out} holds {some(taken)}, of no run, which a run would write over: name another folder"
+            f"{out} holds {some(taken)}, not of a run, which a run would overwrite: name another folder"
         )
     return names
 
@@ -202,7 +202,7 @@ class Named:
         pairs = [
             f"{file.relative_to(self._root).as_posix()} for {name}" for name, file in self.by_name.items()
         ]
-        return [f"{len(pairs)} {what} were found by name, not at their written paths: {some(pairs)}"]
+        return [f"{len(pairs)} {what} were found by name, not at the given paths: {some(pairs)}"]
 
 
 def _posix(name: str) -> str:

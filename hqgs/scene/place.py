@@ -52,14 +52,14 @@ def without_poseless(root: Path, capture: Capture, notes: list[str]) -> Capture:
     first = found.photos[0].viewmat
     if len(found.photos) > 2 and all(np.array_equal(photo.viewmat, first) for photo in found.photos):
         raise ValueError(
-            f"{root}: all {len(found.photos)} photos have the same pose, so that it is none; `--sfm` finds "
-            "poses"
+            f"{root}: all {len(found.photos)} photos have the same pose, which cannot be right; `--sfm` "
+            "finds poses"
         )
     centers = _centers(found)
     if len(centers) > 2 and np.ptp(centers, axis=0).max() <= ONE_PLACE * np.abs(centers).max():
         notes.append(
-            f"all {len(centers)} cameras stand in one place, and nothing tells how far things are: are their "
-            "poses of another kind than the format has (world to camera, camera to world)?"
+            f"all {len(centers)} cameras are at the same place, so distances are unknown: are the poses "
+            "inverted (world to camera instead of camera to world)?"
         )
     return found
 
@@ -80,7 +80,7 @@ def without_strays(capture: Capture, notes: list[str]) -> Capture:
     gone = {photo.name for photo in away if photo.path not in sure}
     if gone:
         notes.append(
-            f"{len(gone)} of {len(capture.photos)} cameras lie far from all others, show none of the points "
+            f"{len(gone)} of {len(capture.photos)} cameras are far from all others, see none of the points "
             f"and were left out: {some(sorted(gone))}"
         )
     return _without(capture, gone)
@@ -103,7 +103,7 @@ def placed(capture: Capture, notes: list[str]) -> Capture:
     world = world_for(_centers(capture), capture.points)
     if world.ordinary:
         return capture
-    notes.append(f"coordinates are held with {world}; what is written goes back to the frame of the files")
+    notes.append(f"coordinates are converted to {world}; files are written in the frame of the input")
     photos = [replace(photo, viewmat=world.viewmat_into(photo.viewmat)) for photo in capture.photos]
     bounds = {k: (near / world.unit, far / world.unit) for k, (near, far) in capture.near_far.items()}
     return replace(capture, photos=photos, points=world.into(capture.points), near_far=bounds, world=world)

@@ -122,7 +122,7 @@ def _load(weights: Path) -> tuple[_Network, str]:
     invents = network.purpose == "FaceSR" or network.architecture.id in RANDOM
     if not isinstance(network, spandrel.ImageModelDescriptor) or invents:
         raise ValueError(
-            f"{weights}: {network.architecture.name} ({network.purpose}) makes up detail; wanted "
+            f"{weights}: {network.architecture.name} ({network.purpose}) invents detail; wanted "
             "a network for denoising, deblurring, JPEG or super-resolution"
         )
     channels = network.input_channels, network.output_channels

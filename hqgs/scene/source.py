@@ -106,7 +106,7 @@ def load(
     )
     scene = load_as(options, cache, points, on_stage)
     if str(path) == EMBEDDED and not named:
-        note = f"{options.path} is taken, the folder, not the built-in scene of that name"
+        note = f"{options.path}: the folder is used, not the built-in scene of that name"
         scene = replace(scene, notes=[note, *scene.notes])
     return scene
 

@@ -61,7 +61,7 @@ def direction_of(up: Sequence[float]) -> Floats:
 
 def as_asked(scene: Scene, up: Floats) -> Scene:
     """The scene with `up` as `direction_of` has it, and a note."""
-    return _told(scene, up, "as it was asked for")
+    return _told(scene, up, "as given")
 
 
 def with_up(scene: Scene) -> Scene:
@@ -75,7 +75,7 @@ def with_up(scene: Scene) -> Scene:
         return scene
     found = by_edges(views, before) or _by_gps(scene)
     if found is None:
-        note = "up is as the photos were held: no upright edges or GPS tell it better"
+        note = "up is as the photos were held, as upright edges or GPS are not clear enough"
         return replace(scene, notes=[*scene.notes, note])
     moved = math.degrees(math.acos(min(float(found.direction @ before), 1.0)))
     why = (

@@ -99,11 +99,11 @@ class World:
             up = tuple(float(x) for x in value["up"]) if "up" in value else None
             place = Georeference(**value["place"]) if "place" in value else None
         except (TypeError, KeyError, ValueError, OverflowError) as error:
-            raise ValueError(f"no unit and shift of a world: {value!r:.80}") from error
+            raise ValueError(f"not a unit and shift of a world: {value!r:.80}") from error
         known = metres is None or 0 < metres < math.inf
         known = known and (up is None or (len(up) == 3 and abs(math.hypot(*up) - 1) < 1e-6))
         if not (0 < unit < math.inf and known) or len(shift) != 3 or not all(map(math.isfinite, shift)):
-            raise ValueError(f"no unit and shift of a world: {value!r:.80}")
+            raise ValueError(f"not a unit and shift of a world: {value!r:.80}")
         upward = None if up is None else (up[0], up[1], up[2])
         return cls(unit, (shift[0], shift[1], shift[2]), metres, upward, place)
 

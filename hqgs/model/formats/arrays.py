@@ -67,7 +67,7 @@ def writable(arrays: Arrays, what: str = "", *, curve: bool = False) -> tuple[Ar
         whole_rows(arrays) & (np.square(arrays["quats"].astype(np.float64)).sum(axis=1) > 0)
     )
     if what and not len(keep):
-        raise ValueError(f"no Gaussian to write, and a {what} file has one at least")
+        raise ValueError(f"no Gaussian to write; a {what} file needs at least one")
     rows = keep[curve_order(arrays["means"][keep])] if curve else keep
     return pick(arrays, rows), len(arrays["means"]) - len(keep)
 

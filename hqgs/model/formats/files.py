@@ -100,7 +100,7 @@ def format_of(path: Path, name: str | None = None, *, written: bool = False) -> 
     if held is not None and not any((FORMATS[format].of or format) == held for format in fitting):
         return held
     if not fitting:
-        raise ValueError(f"{path}: the suffix says no format; wanted .{', .'.join(known)}")
+        raise ValueError(f"{path}: unknown suffix; wanted .{', .'.join(known)}")
     return max(fitting, key=len)
 
 
@@ -112,7 +112,7 @@ def format_held(path: Path) -> str | None:
     with path.open("rb") as file:
         head = file.read(512)
     if not head:
-        raise ValueError(f"{path}: {_NOT} empty: its download did not succeed")
+        raise ValueError(f"{path}: {_NOT} empty: the download failed")
     if head.startswith(b"version https://git-lfs"):
         raise ValueError(f"{path}: {_NOT} a pointer of Git LFS: `git lfs pull` fetches the file")
     if head.lstrip().lower().startswith(_PAGES):
@@ -155,7 +155,7 @@ def scene_file(path: str | Path) -> Path:
         return file
     if is_run(path):
         raise FileNotFoundError(
-            f"{path} holds a run that has not ended, and no scene yet: "
-            f"hqgs train PHOTOS --out {path} --resume goes on"
+            f"{path} holds an unfinished run without a scene: "
+            f"hqgs train PHOTOS --out {path} --resume continues it"
         )
     raise FileNotFoundError(f"there is no {file}: give the folder of a run, or a scene file")

@@ -139,7 +139,7 @@ def read_gltf(path: Path) -> Arrays:
     content, buffers = _content(path)
     required = content.get("extensionsRequired", [])
     if needed := [name for name in required if name not in _KNOWN and not name.startswith(_OF_MATERIALS)]:
-        raise ValueError(f"it needs what is not read here: {', '.join(needed)}")
+        raise ValueError(f"it needs extensions that hqgs does not read: {', '.join(needed)}")
     extras = content["asset"].get("extras")
     said = extras.get("hqgs_world") if isinstance(extras, dict) else None
     world = World() if said is None else World.of_json(said)
@@ -165,7 +165,7 @@ def read_gltf(path: Path) -> Arrays:
     else:
         found["world"] = world
     if said is not None and not still:
-        notes.append("another program moved it: it is where its node says")
+        notes.append("another program moved it: the transform of its node was applied")
         if all(np.array_equal(by, maps[0]) for by in maps):
             found["moved"] = maps[0]
     return {**found, "notes": notes}
@@ -204,11 +204,11 @@ def _gaussians(content: Any, buffers: list[bytes], primitive: Any, notes: list[s
     extension = primitive["extensions"][NAME]
     if inner := extension.get("extensions"):
         raise ValueError(
-            f"its Gaussians need {', '.join(inner)}, which is not read here, such as compression"
+            f"its Gaussians need {', '.join(inner)}, which hqgs does not read, such as compression"
         )
     for name, allowed in _SAYS.items():
         if (said := extension.get(name, allowed[0])) not in allowed:
-            raise ValueError(f"its {name} is {said!r:.60}, read here is: {', '.join(allowed)}")
+            raise ValueError(f"its {name} is {said!r:.60}, wanted one of: {', '.join(allowed)}")
     attributes = primitive["attributes"]
     count = content["accessors"][attributes["POSITION"]]["count"]
     higher = sum(name.startswith(f"{NAME}:SH_DEGREE_") for name in attributes) - 1
@@ -237,9 +237,9 @@ def _gaussians(content: Any, buffers: list[bytes], primitive: Any, notes: list[s
         found["errors"] = sound_errors(values(ERROR, "SCALAR")[:, 0])
     if (space := extension.get("colorSpace")) in _LINEAR:
         found = recolored(found, to_srgb)
-        told = f"its colours are linear ({space}): they became sRGB, each Gaussian's alone"
+        told = f"its colours are linear ({space}): those of each Gaussian were converted to sRGB"
     else:
-        told = "" if space else "it names no colour space: its colours were taken as sRGB"
+        told = "" if space else "it names no colour space: its colours were read as sRGB"
     notes += [told] if told and told not in notes else []
     return found
 
@@ -301,7 +301,7 @@ def _content(path: Path) -> tuple[Any, list[bytes]]:
         elif own is not None and number == 0:
             buffers.append(own)
         else:
-            raise ValueError(f"damaged: buffer {number} is nowhere")
+            raise ValueError(f"damaged: buffer {number} is missing")
     return content, buffers
 
 
@@ -309,14 +309,14 @@ def _outside(path: Path, uri: str) -> bytes:
     if uri.startswith("data:"):
         head, _, data = uri.partition(",")
         if not head.endswith(";base64"):
-            raise ValueError(f"a buffer is no base64 data: {uri[:40]!r}")
+            raise ValueError(f"a buffer is not base64 data: {uri[:40]!r}")
         return base64.b64decode(data, validate=True)
     name = unquote(uri).replace("\\", "/")
     file = (path.parent / name).resolve()
     if "\0" in name or not file.is_relative_to(path.parent.resolve()):
         raise ValueError(f"the buffer {uri!r:.80} leaves the folder")
     if not file.is_file():
-        raise ValueError(f"the buffer {uri!r:.80} is not there: it belongs beside the file")
+        raise ValueError(f"the buffer {uri!r:.80} is missing: it belongs beside the file")
     return file.read_bytes()
 
 
@@ -357,7 +357,7 @@ def _placed_meshes(content: Any) -> Iterator[tuple[int, Array]]:
         number, above, depth = waiting.pop()
         visited += 1
         if depth > DEEPEST or visited > MOST:
-            raise ValueError("its nodes are no tree")
+            raise ValueError("its nodes do not form a tree")
         node = nodes[number]
         here = above @ _matrix(node)
         if "mesh" in node:
@@ -375,7 +375,7 @@ def _matrix(node: Any) -> Array:
     except (TypeError, ValueError):
         found = np.empty(0)
     if found.shape != (4, 4) or not np.isfinite(found).all() or not np.array_equal(found[3], [0, 0, 0, 1]):
-        raise ValueError(f"a node has no map of space: {node!r:.80}")
+        raise ValueError(f"a node has no valid transform: {node!r:.80}")
     return found
 
 

@@ -125,7 +125,7 @@ def read_ply(path: Path) -> Arrays:
     if discs:
         flat = np.float32(math.log(1e-3))
         scales = np.append(scales, scales.min(1, keepdims=True) + flat, axis=1)
-        notes.append("its Gaussians are discs (2DGS): they get a thousandth of their radius as thickness")
+        notes.append("its Gaussians are discs (2DGS): their thickness was set to a thousandth of the radius")
     finite = means[np.isfinite(means).all(1)]
     if wide and world.ordinary and len(finite):
         world = replace(world, shift=world_for(finite, finite).shift)
@@ -152,9 +152,9 @@ def read_ply(path: Path) -> Arrays:
     arrays = _whole(arrays, vertices, notes)
     for count, what in zip(clamped, ("infinite opacities", "scales of 0"), strict=True):
         if count:
-            notes.append(f"{count} {what} became the nearest that there is")
+            notes.append(f"{count} {what} were replaced by the nearest valid value")
     if more := bytes_after(path, header):
-        notes.append(f"{more} bytes after its last row were passed by")
+        notes.append(f"{more} bytes after its last row were ignored")
     return {**arrays, **told, "world": world, "notes": notes}
 
 
@@ -173,10 +173,10 @@ def _as_stored(
     """Logits and logarithms, of values of another program that may be neither; `notes` tell."""
     if not _are_shares(opacities):
         return opacities, scales
-    notes.append("its opacities lie between 0 and 1: they were read as shares, not as logits")
+    notes.append("its opacities are between 0 and 1: they were read as they are, not as logits")
     if (scales > 0).all():
         scales = np.log(scales)
-        notes.append("none of its scales is below 0: they were read as lengths, not as logarithms")
+        notes.append("its scales are all positive: they were read as lengths, not as logarithms")
     return to_logits(opacities, SHARE_STEP), scales
 
 
@@ -195,7 +195,11 @@ def _check_columns(present: set[str], wanted: list[str]) -> None:
     """ValueError where a column is missing, or the harmonics are of no degree."""
     if missing := [name for name in (*_MEANS, *wanted, *_QUATS) if name not in present]:
         points = {*_MEANS} <= present and not {"opacity", *_SCALES} & present
-        why = "; it holds points alone, of which `hqgs train` makes a scene by their photos" if points else ""
+        why = (
+            "; it holds only points, from which `hqgs train` makes a scene, with their photos"
+            if points
+            else ""
+        )
         raise ValueError(f"not a 3DGS scene, these properties are missing: {', '.join(missing)}{why}")
     rest = sum(name.startswith("f_rest_") for name in wanted)
     if rest not in [*_REST_COUNTS, _REST_4]:

@@ -57,7 +57,7 @@ def told_by(comments: list[str]) -> Told:
             told["world"] = replace(world, metres=1.0)
             told["notes"].append("its unit is a metre, as its header says")
         elif mode or (not comment.startswith(OURS) and _TELLING.search(line)):
-            told["notes"].append(f"its header says {comment!r:.100}, which is not heeded here")
+            told["notes"].append(f"its header says {comment!r:.100}, which was ignored")
     return told
 
 

@@ -125,7 +125,7 @@ def read_sog(path: Path) -> Arrays:
 
             return _read(member)
     if not path.name.lower().endswith(META):
-        raise ValueError("not a readable SOG scene: it is no zip file")
+        raise ValueError("not a readable SOG scene: it is not a zip file")
 
     def beside(name: str) -> bytes:
         return path.read_bytes() if name == META else (path.parent / name).read_bytes()
@@ -142,7 +142,7 @@ def _read(file: Callable[[str], bytes]) -> Arrays:
     def pixels(part: dict[str, Any], number: int = 0, rows: int | None = count) -> Bytes:
         name = part["files"][number]
         if Path(name).name != name or name.startswith("."):
-            raise ValueError(f"the picture {name!r} lies elsewhere")
+            raise ValueError(f"the picture {name!r} is outside of its folder")
         with Image.open(io.BytesIO(file(name))) as picture:
             if rows is not None and picture.width * picture.height < rows:
                 raise ValueError(f"{name} is {picture.width} x {picture.height}, too small for {rows}")
@@ -190,7 +190,7 @@ def _quats(packed: Bytes) -> NDArray[np.float64]:
     """w x y z of three components in 8 bits each, and the place of the fourth, the largest."""
     place = packed[:, 3].astype(np.int64) - LARGEST
     if (place < 0).any():
-        raise ValueError("a rotation does not say which component it leaves out")
+        raise ValueError("a rotation lacks the number of its omitted component")
     return of_smallest_three(place, (packed[:, :3] / 255 - 0.5) * np.sqrt(2))
 
 

@@ -44,12 +44,12 @@ def read_splat(path: Path) -> Arrays:
     """
     data = path.read_bytes()
     if len(data) % ROW.itemsize or not data:
-        raise ValueError(f"not a .splat file: {len(data)} bytes are no rows of {ROW.itemsize}")
+        raise ValueError(f"not a .splat file: {len(data)} bytes cannot be split into rows of {ROW.itemsize}")
     rows = np.frombuffer(data, ROW)
     for name, least in (("means", -np.inf), ("scales", 0)):
         bad = np.flatnonzero(~(np.isfinite(rows[name]) & (rows[name] >= least)).all(axis=1))
         if bad.size:
-            raise ValueError(f"{name} are no numbers of a Gaussian in {bad.size} rows, the first is {bad[0]}")
+            raise ValueError(f"{name} are not valid in {bad.size} rows, the first is {bad[0]}")
     return {
         "means": rows["means"],
         "scales": np.log(np.maximum(rows["scales"], LEAST_SCALE)),

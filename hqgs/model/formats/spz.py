@@ -173,7 +173,7 @@ def read_spz(path: Path) -> Arrays:
         "opacities": to_logits(opacities.reshape(n) / 255, 1 / 255),
         "sh0": ((colors - 127.5) / COLOR).reshape(n, 1, 3),
         "shN": FLIP_SH[:rest, None] * (sh.reshape(n, stored, 3)[:, :rest] / SH_ONE - 1),
-        "notes": notes + (["its extensions were passed by"] if flags & EXTENDED else []),
+        "notes": notes + (["its extensions were ignored"] if flags & EXTENDED else []),
         "antialiased": bool(flags & ANTIALIASED),
     }
 

@@ -28,7 +28,7 @@ def mapped(arrays: Arrays, linear: Array, shift: Array) -> Arrays:
         return {**arrays, "means": means}
     u, stretch, vt = np.linalg.svd(linear)
     if not stretch[2] > 1e-12 * stretch[0]:
-        raise ValueError(f"a map that is singular: {linear.tolist()}")
+        raise ValueError(f"the transform is singular: {linear.tolist()}")
     rotation = u @ vt
     quats, logs = arrays["quats"].astype(np.float64), arrays["scales"].astype(np.float64)
     if np.ptp(stretch) < ROUNDING * stretch[0] and np.linalg.det(rotation) > 0:

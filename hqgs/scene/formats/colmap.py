@@ -106,7 +106,7 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     test_names = None
     split, known = listed_split([path, root], root), names_by_any([*images])
     if split is not None and not split.names_any(known):
-        notes.append(f"{split.source} names none of the photos: it is not taken for a split")
+        notes.append(f"{split.source} names none of the photos, and is not used as a split")
     elif split is not None:
         kept, test_names = held_out(split, [*images], known, notes)
         photos = [photo for photo in photos if photo.name in kept | test_names]
@@ -199,7 +199,7 @@ def _tracks(model: pycolmap.Reconstruction, path: Path) -> TrackStatistics | Non
             return None
         return TrackStatistics(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
     except ValueError as e:
-        raise ValueError(f"{path}: a point was seen by a photo that the model lacks: {e}") from e
+        raise ValueError(f"{path}: a point refers to a photo that is not in the model: {e}") from e
 
 
 def _read_model(folder: Path, notes: list[str]) -> pycolmap.Reconstruction:

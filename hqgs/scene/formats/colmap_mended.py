@@ -45,7 +45,7 @@ def mended(folder: Path, notes: list[str]) -> Iterator[Path]:
     if kind == "txt":
         if _COMMA.search(plain["cameras.txt"]):
             plain = {name: _COMMA.sub(rb"\1.\2", text) for name, text in plain.items()}
-            notes.append("the model's numbers have decimal commas, which were read as points")
+            notes.append("the model's numbers have decimal commas, which were read as decimal points")
         plain["images.txt"] = _photo_lines(plain["images.txt"], notes)
     points = f"{POINTS}.{kind}"
     bare = not (folder / points).is_file()

@@ -76,7 +76,9 @@ def match_some(names: list[str], root: Path, folder: Path, notes: list[str]) -> 
     all_names = list_photos(originals) if originals.is_dir() else names
     scaled = folder.name.startswith("images_") and set(names) <= set(all_names)
     if scaled and len(all_names) == len(present) and not any(map(listed.up_to_suffix, names)):
-        notes.append(f"{folder.name} has other file names than the cameras: matched by sorted position")
+        notes.append(
+            f"{folder.name} has other file names than the cameras: photos were assigned in sorted order"
+        )
         return {n: folder / p for n, p in zip(all_names, present, strict=True) if n in set(names)}
     files = files_named(folder, names, "the COLMAP model's photo", listed)
     notes += listed.note()

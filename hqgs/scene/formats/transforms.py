@@ -81,7 +81,7 @@ def read_transforms(root: Path, downscale: float) -> Capture:
         if main == SINGLE:
             photos = [p for p in photos if p.name not in test_names]
         photos = photos + test
-        notes.append(f"the test views are the {len(test)} of {split_file}; test_every has no say")
+        notes.append(f"the test views are the {len(test)} of {split_file}; test_every is not used")
         unread = [
             name for name in (VAL, SINGLE) if (root / name).is_file() and name not in (main, split_file)
         ]
@@ -133,7 +133,7 @@ def _pose(frame: dict[str, Any], where: str) -> NDArray[np.float64]:
         return _matrix(value, where)
     viewmat = np.vstack([_matrix(inverse, where), [0, 0, 0, 1]])
     if np.isfinite(viewmat).all() and np.linalg.matrix_rank(viewmat) < 4:
-        raise ValueError(f"{where}: {viewmat.tolist()} is no matrix of a pose")
+        raise ValueError(f"{where}: {viewmat.tolist()} is not a pose matrix")
     return np.linalg.inv(viewmat)[:3]
 
 
@@ -390,7 +390,7 @@ def _of_matrix(value: object, what: str) -> dict[str, float]:
         or K[0, 0] == 0
         or K[1, 1] == 0
     ):
-        raise ValueError(f"{what} is no matrix of intrinsics: {K.tolist()}")
+        raise ValueError(f"{what} is not a matrix of intrinsics: {K.tolist()}")
     if abs(K[0, 1]) > _SKEW * abs(K[0, 0]):
-        raise ValueError(f"{what} has a skew of {K[0, 1]:g}, which no camera here has")
+        raise ValueError(f"{what} has a skew of {K[0, 1]:g}, wanted 0")
     return {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}

@@ -230,7 +230,7 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
         told = profiles.told({name: seen.colors for name, seen in looked.items()})
         notes = [_understood(exif, len(twice), sphere), *notes, *told]
         for note in (notes[0], *told):
-            on_stage(Stage("photos looked at", len(photos.names), len(photos.names), note))
+            on_stage(Stage("photos read", len(photos.names), len(photos.names), note))
     return replace(
         photos,
         names=[*looked],
@@ -269,7 +269,7 @@ def _looked_at(photos: BarePhotos, on_stage: OnStage) -> tuple[dict[str, Glance]
                 unreadable[as_text(name)] = found
             else:
                 looked[name] = found
-            on_stage(Stage("photos looked at", k + 1, len(photos.names)))
+            on_stage(Stage("photos read", k + 1, len(photos.names)))
     if len(looked) < len(unreadable):
         reasons = some([f"{name} ({why})" for name, why in unreadable.items()])
         raise ValueError(
