@@ -16,10 +16,12 @@ from hqgs.base.files import CAMERAS, PHOTOS, atomic_path, read_json, write_json
 from hqgs.photos.files import LARGEST
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.photos.video import FPS
-from hqgs.scene.constants import BACKGROUND, KEPT_SIDE, MOST_FRAMES
+from hqgs.scene.constants import BACKGROUND, KEPT_SIDE
 from hqgs.scene.paths import scene_up, view_matrix
 from hqgs.scene.scene import Camera, Scene
 from hqgs.scene.world import World
+
+MOST_FRAMES = 100_000  # of a camera path in a file
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes (y up, z back) to OpenCV's
 

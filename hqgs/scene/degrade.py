@@ -18,10 +18,11 @@ from hqgs.photos.formula import KINDS, Degradation
 from hqgs.photos.pixels import to_uint8
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.capture import inside
-from hqgs.scene.constants import SOME_FACTORS
 from hqgs.scene.formats.colmap import write_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, write_degraded_folder
 from hqgs.scene.scene import Scene, View
+
+SOME_FACTORS = (0.5, 1.5)  # of a `some` step's value: the least and the most
 
 _CHOICE = 1  # third word of the choice's seed; a photo's own generator has two
 

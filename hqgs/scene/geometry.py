@@ -12,8 +12,9 @@ from torch import Tensor
 
 from hqgs._rust import NEAR_PLANE
 from hqgs.photos.resize import Pixels, area_downscale
-from hqgs.scene.constants import PICTURE_MARGIN
 from hqgs.scene.scene import Camera, Scene, View
+
+PICTURE_MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
 
 
 def unproject(

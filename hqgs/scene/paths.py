@@ -10,8 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hqgs.base.evenly import evenly
-from hqgs.scene.constants import LEAP, MOST_KEYS, MOST_WALKED, PATH_FOV, PATH_SIZE, TURN_EXTENT
+from hqgs.scene.constants import PATH_FOV, PATH_SIZE
 from hqgs.scene.scene import Camera, Scene
+
+MOST_WALKED, MOST_KEYS = 400, 24  # cameras that are put in order; that a path goes through: more shake it
+LEAP = 10.0  # median steps: south 26, from one side of a house to another; films and walks around up to 7
+TURN_EXTENT = 0.5  # of the cameras' extent: the way that counts as much as a turn of one radian
 
 UP = (0.0, -1.0, 0.0)  # of a scene that says nothing: COLMAP's first camera has y down
 AROUND = math.radians(150)  # cameras that see their focus from a wider range are walked around in a circle

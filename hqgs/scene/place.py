@@ -12,10 +12,13 @@ from hqgs.base.text import some
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import is_cut_out
 from hqgs.scene.capture import Capture, Photo
-from hqgs.scene.constants import FAR_OFF, GPS_LEAST, LOOKED_AT, ONE_PLACE, SHOWN
+from hqgs.scene.constants import GPS_LEAST, ONE_PLACE, SHOWN
 from hqgs.scene.georeference import Georeference, georeference
 from hqgs.scene.scene import strays
 from hqgs.scene.world import world_for
+
+FAR_OFF = 20.0  # median distances: from here on a camera is asked what of the points it shows
+LOOKED_AT = 1000  # points of a scene that tell what a camera shows
 
 
 def without_missing(root: Path, capture: Capture, notes: list[str]) -> Capture:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import EMPTY, RANDOM_POINTS
+from hqgs.scene.constants import EMPTY
 from hqgs.scene.geometry import unproject
 from hqgs.scene.paths import sight_lines
 from hqgs.scene.scene import View
+
+RANDOM_POINTS = 20_000  # to start from where a scene has none
 
 NO_POINTS = "no points in the scene"
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from hqgs.base.machine import AT_ONCE
 from hqgs.base.text import some
-from hqgs.scene.constants import STRAY
 from hqgs.scene.georeference import Georeference
 from hqgs.scene.world import World
+
+STRAY = 10.0  # median distances from the cameras' middle: one so far off says nothing of a scene's size
 
 
 @dataclass(frozen=True)

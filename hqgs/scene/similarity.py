@@ -10,7 +10,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import HYPOTHESES, ORIENTATIONS, OUTLIER, ROUNDING
+from hqgs.scene.constants import OUTLIER, ROUNDING
+
+ORIENTATIONS = 0.1  # weight of cameras' orientations beside their centres; decides where those are in line
+HYPOTHESES = 100  # choices of two or three that are tried: enough where half of all are wrong
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp] | NDArray[np.bool_]

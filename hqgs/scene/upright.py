@@ -18,22 +18,20 @@ from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
 from hqgs.photos.pixels import as_floats
-from hqgs.scene.constants import (
-    COPY_SIDE,
-    EDGE_LENGTH,
-    EDGE_OFF,
-    EDGE_STEP,
-    EDGE_WIDTH,
-    EDGES_CLEAR,
-    EDGES_FEWEST,
-    EDGES_SHARE,
-    UP_CONE,
-    UP_PHOTOS,
-    UP_SURE,
-)
+from hqgs.scene.constants import COPY_SIDE
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.paths import scene_up
 from hqgs.scene.scene import Scene, View
+
+# Tried on the room and on 13 captures of others.
+UP_CONE = 15.0  # degrees from how the photos were held, at most
+UP_SURE = 1.0  # degrees: a wider 95 % interval is no answer
+UP_PHOTOS = 24  # spread over the scene
+EDGE_STEP = 0.01  # of white, for each px
+EDGE_LENGTH, EDGE_WIDTH = 0.04, 5.0  # of a photo's longer side, least; px, most
+EDGE_OFF = 0.7  # degrees, sigma, that an upright edge may be off
+EDGES_FEWEST, EDGES_SHARE = 20, 0.3  # upright ones; their share of the length of those within UP_CONE
+EDGES_CLEAR = 2.5  # times what meets in the directions around
 
 Floats = NDArray[np.float64]
 _DRAWS = 100  # of photos, to see how far the answer moves

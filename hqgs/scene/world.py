@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import FAR_ORIGIN, GREATEST, ONE_PLACE, SMALLEST, USUAL
+from hqgs.scene.constants import GREATEST, ONE_PLACE, SMALLEST, USUAL
 from hqgs.scene.georeference import Georeference
+
+FAR_ORIGIN = 16.0  # sizes from the origin: from here on it is moved, before float32 is 1e-3 of 1,000 px off
 
 Array = NDArray[np.floating[Any]]
 
