@@ -265,7 +265,7 @@ def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
-@pytest.mark.parametrize("place", ["degrade_image", "write_colmap", "write_degraded_folder"])
+@pytest.mark.parametrize("place", ["degrade_sequence", "write_colmap", "write_degraded_folder"])
 def test_nothing_is_left_after_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, error: type[BaseException]
 ) -> None:
@@ -273,7 +273,7 @@ def test_nothing_is_left_after_an_error(
 
     def failing(*arguments: Any, **named: Any) -> Any:
         calls.append(arguments)
-        if len(calls) == (3 if place == "degrade_image" else 1):
+        if len(calls) == (3 if place == "degrade_sequence" else 1):
             raise error
         return real(*arguments, **named)
 

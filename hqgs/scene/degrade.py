@@ -13,7 +13,7 @@ from PIL import Image
 
 from hqgs.base.files import atomic_path, new_folder
 from hqgs.base.text import some
-from hqgs.photos.degrade import Degraded, Record, degrade_image, degrade_sequence
+from hqgs.photos.degrade import Degraded, Record, degrade_sequence
 from hqgs.photos.formula import KINDS, Degradation
 from hqgs.photos.pixels import to_uint8
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
@@ -121,44 +121,28 @@ def degraded_views(scene: Scene, degradation: Degradation, seed: int) -> Iterato
     """The training views with what becomes of their photos, as `degrade_scene` says."""
     if seed < 0:
         raise ValueError(f"seed is {seed}, wanted at least 0")
-    if any(KINDS[step.kind].film for step in degradation.steps):
-        yield from _filmed(scene, degradation, seed)
-        return
-    factors = _factors(scene, seed) if degradation.partial else {}
-    rngs = _generators(scene, seed)
-    for view in scene.train:
-        try:
-            result = degrade_image(view.image, degradation, rngs[view.name], factors.get(view.name))
-        except ValueError as error:
-            raise ValueError(f"photo {view.name!r}: {error}") from error
-        yield view, result
-
-
-def _filmed(scene: Scene, degradation: Degradation, seed: int) -> Iterator[tuple[View, Degraded]]:
-    """The same for a degradation with a video: all photos at once, in the order of their names."""
     views = sorted((*scene.train, *scene.test), key=lambda view: view.name)
-    shape = views[0].image.shape
-    for view in views:
-        if view.image.shape != shape:
-            sizes = " and ".join(f"{s[1]} x {s[0]}" for s in (shape, view.image.shape))
-            raise ValueError(
-                f"photo {view.name!r}: a film has one size, but {views[0].name!r} and it have {sizes} px"
+    rngs = {view.name: np.random.default_rng([seed, k]) for k, view in enumerate(views)}
+    factors = _factors(scene, seed) if degradation.partial else {}
+    film = any(KINDS[step.kind].film for step in degradation.steps)
+    for group in [views] if film else [[view] for view in scene.train]:
+        for view in group:
+            if film and view.image.shape != views[0].image.shape:
+                sizes = " and ".join(f"{v.image.shape[1]} x {v.image.shape[0]}" for v in (views[0], view))
+                raise ValueError(
+                    f"photo {view.name!r}: a film has one size, but {views[0].name!r} and it have {sizes} px"
+                )
+        try:
+            results = degrade_sequence(
+                [view.image for view in group],
+                degradation,
+                [rngs[view.name] for view in group],
+                [factors.get(view.name) for view in group],
             )
-    factors, rngs = _factors(scene, seed), _generators(scene, seed)
-    results = degrade_sequence(
-        [view.image for view in views],
-        degradation,
-        [rngs[view.name] for view in views],
-        [factors.get(view.name) for view in views],
-    )
-    by_name = {view.name: result for view, result in zip(views, results, strict=True)}
-    for view in scene.train:
-        yield view, by_name[view.name]
-
-
-def _generators(scene: Scene, seed: int) -> dict[str, np.random.Generator]:
-    names = sorted(view.name for view in (*scene.train, *scene.test))
-    return {name: np.random.default_rng([seed, k]) for k, name in enumerate(names)}
+        except ValueError as error:
+            raise ValueError(f"photo {group[0].name!r}: {error}") from error
+        found = {view.name: result for view, result in zip(group, results, strict=True)}
+        yield from ((view, found[view.name]) for view in (scene.train if film else group))
 
 
 def _factors(scene: Scene, seed: int) -> dict[str, float]:
