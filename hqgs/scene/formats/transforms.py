@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 
 from hqgs.base.files import read_json
 from hqgs.photos.files import UnreadableError, stored_size
-from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.capture import Capture, Photo, files_named, inside, keep_finite, no_points, viewmat_from_pose
 from hqgs.scene.constants import MOST_SIDE, SMALLEST_SIDE
 from hqgs.scene.faces import AROUND, around
 from hqgs.scene.formats.point_files import read_ply_points
 from hqgs.scene.masks import masks_of
 from hqgs.scene.named_split import held_out, lists_in, names_by_any
-from hqgs.scene.photo_files import MASKS, Named, below
+from hqgs.scene.photo_files import MASKS, Named
 
 SINGLE = "transforms.json"
 TRAIN, TEST, VAL = "transforms_train.json", "transforms_test.json", "transforms_val.json"
@@ -157,7 +156,7 @@ def _read_frames(
     root: Path, file: str, meta: dict[str, Any], paths: dict[str, Path]
 ) -> tuple[list[Photo], dict[str, str]]:
     """The photos of a file, and their names by what the file calls them."""
-    photos, called = list[Photo](), dict[str, str]()
+    photos, called, in_masks = list[Photo](), dict[str, str](), Named(root / MASKS)
     for i, frame in enumerate(meta["frames"]):
         where = f"{root / file}, frame {i}"
         if not isinstance(frame, dict):
@@ -170,10 +169,10 @@ def _read_frames(
         c2w = _pose(frame, where)
         c2w[:, :3] *= _OPENGL_TO_OPENCV
         viewmat = viewmat_from_pose(c2w, name, camera_to_world=True)
-        mask = frame.get("mask_path")
-        mask_path = None
+        mask, mask_path = frame.get("mask_path"), None
         if mask not in (None, ""):
-            mask_path = _mask_path(root, _text(mask, "mask_path", where))
+            mask = _text(mask, "mask_path", where)
+            mask_path = files_named(root, [mask], "mask_path", in_masks).get(mask)
             if mask_path is None and os.path.lexists(path):
                 raise FileNotFoundError(f"{where}: mask_path {mask!r} names no file")
         try:
@@ -202,23 +201,6 @@ def _once(root: Path, photos: list[Photo]) -> list[Photo]:
         if not np.allclose(first.viewmat, photo.viewmat, equal_nan=True):
             raise ValueError(f"{root}: photo {photo.name!r} appears more than once, with different poses")
     return [*found.values()]
-
-
-def _mask_path(root: Path, written: str) -> Path | None:
-    """The mask of that name; by name alone where it is the only file in `root` that is called so."""
-    try:
-        path = inside(root, written.replace("\\", "/"), "mask_path")
-        if path.is_file():
-            return path
-    except ValueError:
-        path = None
-    last = written.replace("\\", "/").rsplit("/", 1)[-1]
-    same = [found for found in below(root / MASKS, PHOTO_SUFFIXES) if found.name == last]
-    if len(same) == 1:
-        return same[0]
-    if path is None:
-        inside(root, written.replace("\\", "/"), "mask_path")
-    return None
 
 
 def _number(values: dict[str, Any], key: str, where: str) -> float | None:
