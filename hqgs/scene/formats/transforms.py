@@ -290,10 +290,7 @@ def _matrix(value: object, where: str) -> NDArray[np.float64]:
     """
     if value is None:
         return np.full((3, 4), np.nan)
-    try:
-        matrix = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError) as e:
-        raise ValueError(f"{where}: transform_matrix must be numbers: {e}") from e
+    matrix = _array(value, f"{where}: transform_matrix")
     if matrix.shape in ((16,), (12,)):
         matrix = matrix.reshape(-1, 4)
     last = np.array([0, 0, 0, 1.0])
@@ -304,6 +301,13 @@ def _matrix(value: object, where: str) -> NDArray[np.float64]:
     if len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise ValueError(f"{where}: the last row of transform_matrix is {matrix[3].tolist()}, not 0 0 0 1")
     return matrix[:3]
+
+
+def _array(value: Any, what: str) -> NDArray[np.float64]:
+    try:
+        return np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{what} must be numbers: {error}") from error
 
 
 def _text(value: object, key: str, where: object) -> str:
@@ -334,10 +338,7 @@ def _with_matrix(values: dict[str, Any], fisheye: bool, where: str) -> dict[str,
     listed = next((values[key] for key in _DISTORTIONS if key in values), None)
     if listed is None or isinstance(listed, dict) or any(key in found for key in _OF_OPENCV):
         return found
-    try:
-        numbers = np.asarray(listed, np.float64).ravel().tolist()
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: distortion must be numbers, got {listed!r:.80}") from error
+    numbers = _array(listed, f"{where}: distortion").ravel().tolist()
     order = _OF_FISHEYE if fisheye else _OF_OPENCV
     if any(numbers[len(order) :]):
         raise ValueError(f"{where}: distortion must be {' '.join(order)}, got {listed!r:.80}")
@@ -352,10 +353,7 @@ def _under(of_file: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def _of_matrix(value: object, what: str) -> dict[str, float]:
-    try:
-        matrix = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{what} must be numbers: {error}") from error
+    matrix = _array(value, what)
     if matrix.shape == (4,):
         return dict(zip(("fl_x", "fl_y", "cx", "cy"), matrix.tolist(), strict=True))
     if matrix.size in (9, 16) and matrix.ndim == 1:
