@@ -19,6 +19,10 @@ _NEUTRAL = {
     "with_eval3d": (False,),
     "rolling_shutter": (None, 0),
 }
+_KNOWN = {
+    *_NEUTRAL, "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs",
+    "lidar_coeffs", "external_distortion_coeffs", "viewmats_rs", "extra_signals", "rays",
+}  # fmt: skip
 _REASONS = {
     "distributed": "hqgs renders in one process",
     "extra_signals": "hqgs renders what is in colors; append the signals to them",
@@ -27,12 +31,8 @@ _REASONS = {
 
 def refuse(unsupported: dict[str, object]) -> None:
     """NotImplementedError for what hqgs leaves out, TypeError for what gsplat has not either."""
-    known = {
-        *_NEUTRAL, "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs",
-        "lidar_coeffs", "external_distortion_coeffs", "viewmats_rs", "extra_signals", "rays",
-    }  # fmt: skip
     for name, value in unsupported.items():
-        if name not in known:
+        if name not in _KNOWN:
             raise TypeError(f"rasterization() got an unexpected keyword argument {name!r}")
         neutral = _NEUTRAL.get(name, (None,))
         plain = isinstance(value, bool | int | float | str | None)
@@ -77,7 +77,7 @@ def check_tensors(tensors: dict[str, Tensor], viewmats: Tensor, Ks: Tensor) -> N
     for name, value in {**tensors, "viewmats": viewmats, "Ks": Ks}.items():
         if not isinstance(value, Tensor):
             raise ValueError(f"{name}: expected a torch tensor, got {short(value)}")
-        if value.device.type != "cpu":
+        if not value.is_cpu:
             raise ValueError(f"{name}: must be on the CPU, got a tensor on {value.device}")
         if value.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{name}: must be float32 or float64, got {value.dtype}")
@@ -86,12 +86,12 @@ def check_tensors(tensors: dict[str, Tensor], viewmats: Tensor, Ks: Tensor) -> N
         if value.dtype != means.dtype:
             raise ValueError(f"{name}: must have the dtype of means, {means.dtype}, got {value.dtype}")
     _check_shape("means", means, "N", 3)
-    n = len(means)
-    for name, shape in (("quats", [n, 4]), ("scales", [n, 3]), ("opacities", [n])):
-        if list(tensors[name].shape) != shape:
-            raise ValueError(f"{name}: expected shape {shape}, got {shape_of(tensors[name])}")
+    n = means.shape[0]
+    for name, shape in (("quats", (n, 4)), ("scales", (n, 3)), ("opacities", (n,))):
+        if tensors[name].shape != shape:
+            raise ValueError(f"{name}: expected shape {list(shape)}, got {shape_of(tensors[name])}")
     _check_shape("viewmats", viewmats, "C", 4, 4)
-    c = len(viewmats)
+    c = viewmats.shape[0]
     if c == 0:
         raise ValueError(f"viewmats: expected shape [C >= 1, 4, 4], got {shape_of(viewmats)}")
     if list(Ks.shape) != [c, 3, 3]:

@@ -15,11 +15,17 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.model.covariances import whole
 
 LEAST_ALPHA = 1e-10  # by which an expected depth is divided
+_ZERO = {dtype: torch.zeros((), dtype=dtype) for dtype in (torch.float32, torch.float64)}
 
 
 def as_array(tensor: Tensor) -> np.ndarray[Any, Any]:
-    """The tensor's memory as a C-contiguous array; copied only if it is not contiguous."""
-    return tensor.detach().contiguous().numpy()
+    """The tensor's memory as a C-contiguous array; copied only if it is not contiguous.
+
+    A call of torch that finds nothing to do costs as much as one that does, most of it in cold caches.
+    """
+    if tensor.requires_grad:
+        tensor = tensor.detach()
+    return (tensor if tensor.is_contiguous() else tensor.contiguous()).numpy()
 
 
 def _optional(tensor: Tensor | None) -> np.ndarray[Any, Any] | None:
@@ -27,7 +33,7 @@ def _optional(tensor: Tensor | None) -> np.ndarray[Any, Any] | None:
 
 
 def _tensor(array: np.ndarray[Any, Any] | None, *shape: int) -> Tensor | None:
-    return None if array is None else torch.from_numpy(array).view(shape)
+    return None if array is None else torch.from_numpy(array.reshape(shape))
 
 
 class _First(torch.autograd.Function):
@@ -80,19 +86,19 @@ class _Project(torch.autograd.Function):
         colors_vary = needs_means or needs_viewmats or needs_harmonics or needs_rest
         others = (*options, enabled and colors_vary), sh_degree, activate
         inputs = as_array(means), as_array(quats), as_array(scales), as_array(opacities), as_array(colors)
+        cameras, ctx.pose = [as_array(matrices) for matrices in (viewmats, Ks)], viewmats.dtype
         frame, *arrays = _rust.project_forward(
-            *inputs, _optional(rest), as_array(viewmats), as_array(Ks), width, height, *others
+            *inputs, _optional(rest), *(m.astype(np.float64) for m in cameras), width, height, *others
         )
         n, c = means.shape[0], viewmats.shape[0]
-        means2d, depths, conics, radii, alphas, sh_colors = map(torch.from_numpy, arrays)
         ctx.frame, ctx.shapes, ctx.has_harmonics = frame, (n, c), sh_degree is not None
         ctx.sh_shapes = [() if t is None else tuple(t.shape) for t in (colors, rest)]
         ctx.save_for_backward(means, quats, scales, opacities)
         ctx.set_materialize_grads(False)
-        link = means2d.new_zeros(()).expand(c, n, 3)
-        means2d, depths, conics = means2d.view(c, n, 2), depths.view(c, n), conics.view(c, n, 3)
-        radii, alphas = radii.view(c, n, 2), alphas.view(c, n)
-        sh_colors = sh_colors.view(c, n, 3) if ctx.has_harmonics else sh_colors
+        shapes = (c, n, 2), (c, n), (c, n, 3), (c, n, 2), (c, n), (c, n, 3) if ctx.has_harmonics else (0,)
+        shaped = [torch.from_numpy(array.reshape(shape)) for array, shape in zip(arrays, shapes, strict=True)]
+        means2d, depths, conics, radii, alphas, sh_colors = shaped
+        link = _ZERO[means.dtype].expand(c, n, 3)
         # What depends on no tensor that requires a gradient gets no cotangent, so that none is computed.
         constant = [radii]
         if not (needs_means or needs_viewmats or any(geometry)):
@@ -130,7 +136,8 @@ class _Project(torch.autograd.Function):
         if v_inputs[4] is not None:
             v_inputs[4] = whole(v_inputs[4].reshape(n, 6))
         shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 3, 3), *ctx.sh_shapes, (c, 4, 4)]
-        return (*(_tensor(v, *shape) for v, shape in zip(v_inputs, shapes, strict=True)), None, None, None)
+        *found, pose = (_tensor(v, *shape) for v, shape in zip(v_inputs, shapes, strict=True))
+        return *found, None if pose is None else pose.to(ctx.pose), None, None, None
 
 
 class _Composite(torch.autograd.Function):

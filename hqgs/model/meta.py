@@ -100,22 +100,23 @@ class Meta(dict[str, Any]):
 
 
 class Pairs:
-    """The pairs of scene, camera and Gaussian that are not culled, in this order; `radii` [C, N, 2] of each
-    scene are 0 where culled.
+    """The pairs of scene, camera and Gaussian that are not culled, in this order; of the splats of each scene
+    the `radii` [C, N, 2] are 0 where culled, and the `frame` has counted the others.
 
     Nothing is gathered until the meta data are read: the gradient of the positions goes past `means2d`.
     """
 
-    def __init__(self, radii: Sequence[Tensor]) -> None:
-        self.shape: torch.Size = radii[0].shape[:2]
-        self._seen = [as_array(of_scene).view(np.int64).ravel() for of_scene in radii]  # both radii at once
-        self.counts: list[int] = [int(np.count_nonzero(seen)) for seen in self._seen]
+    def __init__(self, scenes: Sequence[dict[str, Any]]) -> None:
+        self._radii: list[Tensor] = [splats["radii"] for splats in scenes]
+        self.shape: torch.Size = self._radii[0].shape[:2]
+        self.counts: list[int] = [splats["frame"].counts["projected"] for splats in scenes]
         self.asked: bool = False  # for `means2d`
 
     @cached_property
     def where(self) -> list[NDArray[np.intp]]:
         """Of each scene, as numbers of the C * N."""
-        return [np.flatnonzero(seen) for seen in self._seen]
+        # Both radii of a pair at once.
+        return [np.flatnonzero(as_array(radii).view(np.int64)) for radii in self._radii]
 
     def ids(self, kind: int) -> Tensor:
         """The scene, the camera or the Gaussian of each pair, [M]."""

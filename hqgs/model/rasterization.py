@@ -168,7 +168,7 @@ def _rendered(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Images, alphas and what the meta data hold of the splats."""
     projected = [_project(scene, config) for scene in scenes]
-    pairs = Pairs([splats["radii"] for splats in projected]) if packed else None
+    pairs = Pairs(projected) if packed else None
     parts: Sequence[Tensor | None] = [None] * len(scenes)
 
     def together(values: Sequence[Tensor]) -> Tensor:
@@ -223,8 +223,8 @@ def _project(scene: dict[str, Tensor], config: tuple[Any, ...]) -> dict[str, Any
         scene.get("covars"),
         colors if sh_degree is not None else colors.detach(),
         scene.get("colors[1]"),
-        scene["viewmats"].to(torch.float64),
-        scene["Ks"].detach().to(torch.float64),
+        scene["viewmats"],
+        scene["Ks"],
         config,
         torch.is_grad_enabled(),
     )
