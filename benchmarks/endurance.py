@@ -71,9 +71,10 @@ class Case(Row):
         A case that asks for opacity resets has some in a short run, too.
         """
         config = super().train_config(seed, iterations, changes)
-        densify = replace(config.densify, stop=iterations // 2)
+        stop = iterations // 2
+        densify = replace(config.densify, stop=stop)
         if "densify" in self.config:
-            densify = replace(densify, reset_every=min(densify.reset_every, max(1, densify.stop // 4)))
+            densify = replace(densify, reset_every=min(densify.reset_every, max(1, stop // 4)))
         return replace(config, densify=densify)
 
 

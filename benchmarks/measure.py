@@ -94,7 +94,7 @@ def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training
     fit_to_seconds(trainer)
 
     def after(_: Step) -> None:
-        if evaluate and trainer.iteration % trainer.config.eval_every == 0:
+        if evaluate and trainer.iteration % trainer.config.due.eval_every == 0:
             trainer.evaluate()
 
     done.steps(after=after)

@@ -59,10 +59,8 @@ class Row:
 
     def train_config(self, seed: int, iterations: int, changes: dict[str, Any] | None = None) -> TrainConfig:
         """The run, its schedule fitted to its length. `changes`: of the protocol, before those of the row."""
-        config = TrainConfig(
-            iterations=iterations, method=self.method, seed=seed,
-            leave_out=parse_leave_out(self.leave_out),
-        ).scaled()  # fmt: skip
+        items = parse_leave_out(self.leave_out)
+        config = TrainConfig(iterations=iterations, method=self.method, seed=seed, leave_out=items)
         config = build(TrainConfig, changes or {}, "the protocol's config", config)
         return build(TrainConfig, self.config, f"row {self.label!r}, config", config)
 

@@ -14,6 +14,7 @@ from hqgs.base.files import CHECKPOINT, CONFIG, PAGE, PLAN, PLY, lock_folder, re
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import give_back_memory, peak_rss_mb
+from hqgs.base.options import called_with
 from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.state import own_state
@@ -29,12 +30,12 @@ from hqgs.scene.photo_files import strangers
 from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
-from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
+from hqgs.training.config import Said, TrainConfig, TrainOptions, decided, merged
 from hqgs.training.frame import Frame
 from hqgs.training.notes import learned_record, run_notes
 from hqgs.training.plan import essential
 from hqgs.training.progress import OnProgress, progress_of
-from hqgs.training.settings import config_values, plan_values
+from hqgs.training.settings import config_values, plan_values, resumed, said_by
 from hqgs.training.trainer import Trainer, fit_to_seconds
 
 
@@ -62,28 +63,23 @@ class Run:
         return self.iterations == self.length
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainCall(TrainOptions):
+    """The arguments of `train`."""
+
+    scene: Scene = field(kw_only=False)
+    out: str | Path | None = None
+    config: TrainConfig | Said | None = None
+    resume: bool = False
+    overwrite: bool = False
+    progress: OnProgress | None = None
+    on_stage: OnStage = silent
+    ranks: Ranks = ALONE
+
+
+@called_with(TrainCall)
 @own_state(grad=True)
-def train(
-    scene: Scene,
-    *,
-    out: str | Path | None = None,
-    iterations: int | None = None,
-    batch: int = 1,
-    seconds: float | None = None,
-    method: str = AUTO,
-    leave_out: str = AUTO,
-    seed: int = 0,
-    max_gaussians: int = DensifyConfig.max_gaussians,
-    guidance: str = FORMATION,
-    formation: str = AUTO,
-    eval_every: int | None = None,
-    config: TrainConfig | None = None,
-    resume: bool = False,
-    overwrite: bool = False,
-    progress: OnProgress | None = None,
-    on_stage: OnStage = silent,
-    ranks: Ranks = ALONE,
-) -> Run:
+def train(call: TrainCall) -> Run:
     """Train a scene on the CPU. Same seed, same bits, for any number of threads, interrupted or not.
 
     The first Ctrl-C (or SIGTERM) ends the run after the step it is in: everything is written and returned,
@@ -108,9 +104,11 @@ def train(
         guidance: of hqgs: "formation", or "paper", its published form.
         formation: what hqgs takes for the photos' degradation, as `hqgs.degrade` reads it; "auto": it looks.
         eval_every: iterations between evaluations; None: a tenth of the run.
-        config: the whole configuration, in place of what before it is part of it.
-        resume: go on from the checkpoint in `out`, if there is one; a run that has come to its end goes on
-            where `iterations` is larger, with the schedule of the longer run from there on.
+        config: a `hqgs.TrainConfig`, or what was said of one, as config.json of a run has it; what is said
+            beside it goes over it.
+        resume: go on from the checkpoint in `out`, if there is one, as was said there where nothing else is
+            said; a run that has come to its end goes on where `iterations` is larger, with the schedule of
+            the longer run from there on.
         overwrite: begin anew in a folder that holds a run.
         progress: is called after each step.
         on_stage: hears what is being done before the first step, and how far it is.
@@ -125,31 +123,24 @@ def train(
         TrainingError: the training cannot go on; the message says at which iteration and why.
         RankError: another of the ranks has failed or gone.
     """
-    asked = run_config(
-        iterations=iterations,
-        batch=batch,
-        method=method,
-        leave_out=leave_out,
-        seed=seed,
-        max_gaussians=max_gaussians,
-        guidance=guidance,
-        formation=formation,
-        eval_every=eval_every,
-    )
-    if config is not None and asked != run_config():
-        raise ValueError("config is the whole configuration: give either config or single options, not both")
-    out = None if out is None else Path(out).expanduser()
+    ranks, out = call.ranks, None if call.out is None else Path(call.out).expanduser()
     taken = ranks.first and out is not None and (out / CHECKPOINT).exists()
-    if taken and not (resume or overwrite):
+    if taken and not (call.resume or call.overwrite):
         raise FileExistsError(f"{out} holds a run; resume=True continues it, overwrite=True starts again")
+    if call.resume and call.overwrite:
+        raise ValueError("resume continues the run, overwrite starts again: give one of them, not both")
+    if call.seconds is not None and call.iterations is not None:
+        raise ValueError("iterations and seconds: only one of them can be given")
+    said, before = call.said(), call.config
+    if before is not None:
+        said = merged(said_by(before) if isinstance(before, TrainConfig) else before, said)
+    elif taken and call.resume and out is not None:
+        said = resumed(out, said)
+    said = ranks.tell(said if ranks.first else None)[0]
     if out is not None and ranks.first and not taken:
         strangers(out)
-    if resume and overwrite:
-        raise ValueError("resume continues the run, overwrite starts again: give one of them, not both")
-    if seconds is not None and iterations is not None:
-        raise ValueError("iterations and seconds: only one of them can be given")
-    with open_run(scene, config or asked, out, resume, seconds, on_stage, ranks) as trainer:
-        return run_to_end(trainer, out, progress)
+    with open_run(call.scene, decided(said), out, call.resume, call.on_stage, ranks, said) as trainer:
+        return run_to_end(trainer, out, call.progress)
 
 
 @contextmanager
@@ -158,20 +149,18 @@ def open_run(
     config: TrainConfig,
     out: str | Path | None = None,
     resume: bool = False,
-    seconds: float | None = None,
     on_stage: OnStage = silent,
     ranks: Ranks = ALONE,
+    said: Said | None = None,
 ) -> Iterator[Trainer]:
     """A trainer that holds the folder `out`: fresh, or with `resume` where the checkpoint there ends.
 
-    With `seconds` a fresh one has as many iterations as fit in. Of several `ranks` the first one holds the
-    folder, and sends the others the checkpoint.
+    Of several `ranks` the first one holds the folder, and sends the others the checkpoint. `said`: what of
+    the configuration somebody has said; None: all.
 
     Without a checkpoint `resume` starts fresh (the run may have been killed before its first one). A fresh
     run removes what an older one left. See `train` for the errors.
     """
-    if seconds is not None:
-        config = replace(config, seconds=seconds)
     folder = Path(out) if out is not None and ranks.first else None
     with nullcontext() if folder is None else lock_folder(folder):
         checkpoint = None
@@ -196,8 +185,9 @@ def open_run(
         if ranks.first:
             on_stage(Stage("planned", 0, 0, essential(trainer.plan)))
         if folder is not None:
-            asked = {"version": __version__, "scene": scene.origin, "train": config_values(config)}
-            write_json(folder / CONFIG, asked)
+            said = said_by(config) if said is None else said
+            asked = {"version": __version__, "scene": scene.origin, "said": said}
+            write_json(folder / CONFIG, asked | {"train": config_values(config)})
         yield trainer
 
 
@@ -235,12 +225,12 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
             def due(every: int, before: int = before) -> bool:
                 return trainer.iteration // every > before // every
 
-            evaluate = due(config.eval_every)
+            evaluate = due(config.due.eval_every)
             if evaluate:
                 trainer.evaluate()
             if progress is not None:
                 progress(progress_of(trainer, step, trainer.history[-1] if evaluate else None))
-            if due(config.checkpoint_every):
+            if due(config.due.checkpoint_every):
                 _check_agreement(trainer)
                 if out is not None:
                     trainer.save(out / CHECKPOINT)
@@ -318,7 +308,7 @@ def _report(
         "photos": [photo_record(p) for p in diagnosis.photos] if diagnosis else [],
         "ranks": ranks,
         "learned": learned,
-        "config": asdict(config),
+        "config": asdict(config.fitted()),
         "plan": rows,
     }
     if out is not None and config.seconds is not None:

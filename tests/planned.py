@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from tiny_scene import tiny_scene
 
 from hqgs.scene.scene import View
-from hqgs.training.config import TrainConfig
+from hqgs.training.config import TrainConfig, decided, merged
 from hqgs.training.plan import RunPlan
 from hqgs.training.prepare import facts_of
 from hqgs.training.rules import plan_run
 from hqgs.training.schedule import Schedule
+from hqgs.training.settings import read_plan, said_by
 
 
 def planned(config: TrainConfig, views: Sequence[View], as_photographed: bool = True) -> RunPlan:
@@ -23,3 +25,8 @@ def planned(config: TrainConfig, views: Sequence[View], as_photographed: bool = 
 
 def schedule_of(config: TrainConfig, views: Sequence[View], as_photographed: bool = True) -> Schedule:
     return Schedule.of(planned(config, views, as_photographed), len(views))
+
+
+def repeated(config: TrainConfig, run: Path) -> TrainConfig:
+    """With the length that the seconds of another run came to, as its folder tells it."""
+    return decided(merged(said_by(config), read_plan(run)))

@@ -53,7 +53,7 @@ def test_what_the_cases_do_to_the_scene() -> None:
 def test_what_the_cases_do_to_the_configuration() -> None:
     config = LONG
     assert config.densify.max_gaussians == 30_000
-    assert (config.iterations, config.densify.stop, config.densify.reset_every) == (20_000, 10_000, 3_000)
+    assert (config.iterations, config.due.stop, config.densify.reset_every) == (20_000, 10_000, 3_000)
     fast = PROTOCOLS["standard"].train_config(case("learning rates x10"), 0)
     rates = {name: 10 * rate for name, rate in vars(config).items() if name.startswith("lr_")}
     assert {name: vars(fast)[name] for name in rates} == pytest.approx(rates, rel=1e-12)

@@ -348,14 +348,14 @@ def test_protocols() -> None:
     assert len({cell.group for cell in standard[:5]}) == 1
     assert {cell.seed for cell in standard[:60]} == {0}
     assert [cell.config.batch for cell in grid(PROTOCOLS["ranks"], [scene])] == [1, 2, 4, 8]
-    assert TrainConfig(50_000).scaled().densify.stop == 15_000
+    assert TrainConfig(50_000).due.stop == 15_000
     for cell in standard:
         if cell.row.label == "no formation":
             assert cell.config.hqgs.formation == "none"
         elif cell.row.label == "paper":
             assert cell.config.hqgs.guidance == "paper"
         else:
-            config = TrainConfig(2_000, cell.row.label, cell.seed, leave_out=()).scaled()
+            config = TrainConfig(2_000, cell.row.label, cell.seed, leave_out=())
             assert cell.config == config
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from planned import planned
+from planned import planned, repeated
 from run_state import assert_same, whole_state
 from test_diagnose import inspected
 from test_learned_cameras import textured_scene
@@ -26,7 +26,7 @@ from hqgs.training.notes import run_notes
 from hqgs.training.plan import StepSeconds
 from hqgs.training.rules import FOR_EACH_PHOTO, GROWS_FROM, LEAST_ENOUGH, PIXELS
 from hqgs.training.schedule import Schedule
-from hqgs.training.settings import plan_values, with_plan
+from hqgs.training.settings import plan_values
 from hqgs.training.trainer import Trainer, fit_to_seconds
 
 N, STOP = 300, 200
@@ -77,7 +77,7 @@ def test_steps_that_are_timed_leave_nothing_behind(formation: str, tmp_path: Pat
     trainer = Trainer(tiny_scene(12), replace(config, seconds=1e-3))
     fit_to_seconds(trainer)
     (tmp_path / PLAN).write_text(json.dumps(plan_values(trainer.config, [])))
-    again = Trainer(tiny_scene(12), with_plan(config, tmp_path))
+    again = Trainer(tiny_scene(12), repeated(config, tmp_path))
     for _ in range(6):
         trainer.step()
         again.step()
@@ -107,13 +107,13 @@ def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: p
     assert (at, length) == (23, run.iterations)
     assert run.report["config"]["turn"] == (at, length)
     assert any("planned for 0.5 s" in note for note in run.report["notes"])
-    again = hqgs.train(scene, out=tmp_path / "b", config=with_plan(config, tmp_path / "a"))
+    again = hqgs.train(scene, out=tmp_path / "b", config=repeated(config, tmp_path / "a"))
     assert again.iterations == run.iterations
     assert (tmp_path / "a" / PLY).read_bytes() == (tmp_path / "b" / PLY).read_bytes()
     other = hqgs.train(scene, config=with_iterations(config, 30))
     assert (other.iterations == run.iterations) == (length == 30)
     kept = json.loads((tmp_path / "a" / CONFIG).read_text())["train"]
-    assert (kept["iterations"], kept["seconds"]) == (500, 0.5)  # as it was asked for
+    assert (kept["iterations"], kept["seconds"]) == (TrainConfig.iterations, 0.5)  # as it was asked for
 
 
 def test_a_run_of_seconds_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,7 +129,7 @@ def test_a_run_of_seconds_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPat
 def test_bad_plans_and_seconds_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = run_config(iterations=100)
     with pytest.raises(FileNotFoundError, match="there is no plan"):
-        with_plan(config, tmp_path)
+        repeated(config, tmp_path)
     for text in (
         "{",
         "[]",
@@ -139,7 +139,7 @@ def test_bad_plans_and_seconds_are_told(tmp_path: Path, capsys: pytest.CaptureFi
     ):
         (tmp_path / PLAN).write_text(text)
         with pytest.raises(ValueError, match="is no plan"):
-            with_plan(config, tmp_path)
+            repeated(config, tmp_path)
     for seconds in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="seconds is"):
             TrainConfig(seconds=seconds)
@@ -169,13 +169,13 @@ def test_clean_photos_start_from_points_that_they_agree_on() -> None:
     dense = trainer()
     assert 2 * len(few.points) < len(dense.gaussians) <= max(2 * pixels // PIXELS, 1.5 * len(few.points))
     assert "resolution" in dense.config.leave_out
-    assert dense.config.densify.start == GROWS_FROM
+    assert dense.config.due.start == GROWS_FROM
     assert any(
         item.what == f"densification in the first {GROWS_FROM} iterations" for item in dense.left_out()
     )
     own = trainer(start_points=0)
     assert len(own.gaussians) == len(few.points)
-    assert own.config.densify.start < GROWS_FROM
+    assert own.config.due.start < GROWS_FROM
     plain = trainer("3dgs")
     assert len(plain.gaussians) == len(few.points)
     assert "resolution" not in plain.config.leave_out
@@ -192,7 +192,7 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
 
     short = trainer()
     assert short.config.iterations == LEAST_ENOUGH == 4_000
-    assert short.config.densify.stop == run_config(iterations=LEAST_ENOUGH).densify.stop
+    assert short.config.due.stop == run_config(iterations=LEAST_ENOUGH).due.stop
     assert "iterations" not in short.config.leave_out  # nothing is held back for it
     assert length in [item.what for item in short.left_out()]
     assert trainer(eval_every=123).config.eval_every == 123

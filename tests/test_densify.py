@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.adam import Adam, reset_opacities
-from hqgs.training.config import DensifyConfig
+from hqgs.training.config import DensifyConfig, TrainConfig
 from hqgs.training.densify import Densification, Densifier, quats_to_matrices
 
 SIZE = 100  # pixels: a gradient of g per pixel counts as 50 g
@@ -251,14 +251,19 @@ def test_all_gaussians_can_go() -> None:
 
 
 def test_schedules_of_other_lengths() -> None:
-    assert DensifyConfig().scaled(30_000) == DensifyConfig()
-    assert DensifyConfig().scaled(50_000) == DensifyConfig()
-    at_7000 = DensifyConfig().scaled(7_000)
-    assert (at_7000.start, at_7000.stop, at_7000.every, at_7000.reset_every) == (500, 4_666, 100, 3_000)
-    short = DensifyConfig().scaled(1_400)
-    assert (short.start, short.stop, short.every, short.reset_every) == (100, 933, 70, 3_000)
-    assert DensifyConfig().scaled(400).every == 20
-    assert DensifyConfig().scaled(1).every == 1
+    lengths = {
+        length: TrainConfig(iterations=length).due for length in (1, 400, 1_400, 7_000, 30_000, 50_000)
+    }
+    assert {length: (due.start, due.stop, due.every) for length, due in lengths.items()} == {
+        1: (0, 0, 1),
+        400: (28, 266, 20),
+        1_400: (100, 933, 70),
+        7_000: (500, 4_666, 100),
+        30_000: (500, 15_000, 100),
+        50_000: (500, 15_000, 100),
+    }
+    said = TrainConfig(iterations=1_400, eval_every=7, densify=DensifyConfig(every=9)).due
+    assert (said.eval_every, said.every, said.start) == (7, 9, 100)
 
 
 def test_the_same_seed_gives_the_same_children() -> None:

@@ -61,7 +61,7 @@ def test_some_photos_are_held_back_until_growth_ends() -> None:
     names = [trainer.step().view.name for _ in range(60)]
     held = {trainer.scene.train[k].name for k in trainer.schedule.held}
     back = trainer.state.decisions.released
-    assert back == trainer.config.densify.stop
+    assert back == trainer.config.due.stop
     assert len(held) == 1
     assert not held & set(names[:back])
     assert set(names[back:]) == {view.name for view in trainer.scene.train}
@@ -96,7 +96,7 @@ def test_fine_gaussians_do_not_grow() -> None:
 def test_the_next_degree_comes_sooner_where_growth_is_left_out(
     items: tuple[str, ...], iterations: int, interval: int
 ) -> None:
-    config = TrainConfig(iterations, "3dgs", leave_out=items).scaled()
+    config = TrainConfig(iterations, "3dgs", leave_out=items)
     schedule = Trainer(tiny_scene(), config).schedule
     assert [schedule.degree(k) for k in (interval - 1, interval, 3 * interval - 1, 3 * interval)] == [
         0,

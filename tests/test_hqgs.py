@@ -220,7 +220,7 @@ def test_degraded_photos_are_trained_without_resets() -> None:
     trainer = Trainer(scene, config)
     resets = LeftOut("opacity resets", "with a limit on Gaussians, lost ones do not come back")
     assert resets in trainer.left_out()
-    while trainer.iteration < config.densify.stop + 1:
+    while trainer.iteration < config.due.stop + 1:
         trainer.step()
     assert trainer.gaussians.activated_opacities().median() > 2 * config.densify.reset_opacity
     assert Trainer(scene, trainer.config).config == trainer.config

@@ -357,7 +357,7 @@ def test_other_steps_come_after_the_camera(formation: str) -> None:
 
 
 def test_without_photos_to_hold_back_a_run_has_a_length() -> None:
-    config = replace(learned_config("shake"), leave_out=("photos", "iterations"), iterations=30_000).scaled()
+    config = replace(learned_config("shake"), leave_out=("photos", "iterations"), iterations=30_000)
     trainer = Trainer(tiny_scene(), config)
     assert trainer.length == 7_000
     assert any("iterations 7001" in item.what for item in trainer.left_out())

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from planned import planned
+from planned import planned, repeated
 from test_diagnose import degraded_scene
 from test_learned_cameras import textured_scene
 from tiny_scene import tiny_config, tiny_scene
@@ -25,7 +25,7 @@ from hqgs.training.config import PRESETS, HQGSConfig, run_config, with_iteration
 from hqgs.training.plan import RunPlan, StepSeconds
 from hqgs.training.prepare import Prepared, facts_of
 from hqgs.training.rules import PIXELS, RULES, Draft, Rule, first_points_wanted, plan_run
-from hqgs.training.settings import plan_values, with_plan
+from hqgs.training.settings import plan_values
 from hqgs.training.trainer import Trainer
 from hqgs.training.trial import _settings
 
@@ -97,7 +97,7 @@ def test_a_repeat_of_seconds_starts_from_as_many_points(tmp_path: Path) -> None:
     run = plan_run(timed, None, replace(asked, seconds=1.0))
     assert run.settings.iterations < 20 * facts.photos
     (tmp_path / PLAN).write_text(json.dumps(plan_values(run.settings, [])))
-    again = plan_run(facts, None, with_plan(asked, tmp_path))
+    again = plan_run(facts, None, repeated(asked, tmp_path))
     assert (again.settings.iterations, again.first_points) == (run.settings.iterations, run.first_points)
     short = [_settings(of.settings, facts.photos, "none", 400) for of in (again, run)]  # of its trial
     assert short[0] == short[1]

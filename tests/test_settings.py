@@ -12,16 +12,25 @@ from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.base.files import CHECKPOINT, CONFIG
 from hqgs.cli.main import COMMANDS, main
-from hqgs.cli.train import Train, Whole, config_of, loading, read
+from hqgs.cli.train import Train, asked_for, loading, read
+from hqgs.evaluation.run_folder import RunFolder
 from hqgs.evaluation.verdict import verdict
 from hqgs.pipeline import train
 from hqgs.scene.options import LoadOptions
-from hqgs.training.config import PRESETS, TrainConfig, run_config, with_iterations
-from hqgs.training.settings import config_values, read_config
+from hqgs.training.config import PRESETS, TrainConfig, decided, merged, run_config, with_iterations
+from hqgs.training.settings import config_values, read_said, said_by
 
 
 def options(*arguments: str | Path) -> Train:
     return read(Train, "train", "train", ["photos", "--out", "nowhere", *map(str, arguments)])
+
+
+def config_of(options: Train) -> TrainConfig:
+    return decided(asked_for(options))
+
+
+def read_config(path: Path) -> TrainConfig:
+    return decided(read_said(path))
 
 
 def test_a_configuration_comes_back_from_its_file(tmp_path: Path) -> None:
@@ -29,11 +38,29 @@ def test_a_configuration_comes_back_from_its_file(tmp_path: Path) -> None:
     for values in (config_values(config), {"train": config_values(config), "scene": None}):
         (tmp_path / "config.json").write_text(json.dumps(values))
         assert read_config(tmp_path / "config.json") == read_config(tmp_path) == config
-    former = config_values(config)
-    former["hqgs"]["paper"] = {"loss": "l1+scs"}
-    former["leave_out"] = ["photos", "passersby", "growth", "weight"]  # what there is no more
-    (tmp_path / "config.json").write_text(json.dumps(former))
-    assert read_config(tmp_path) == replace(config, leave_out=("photos", "growth"))
+    for own in (config, tiny_config(), TrainConfig()):
+        (tmp_path / "config.json").write_text(json.dumps({"said": said_by(own), "train": {"seed": 99}}))
+        assert read_config(tmp_path) == own
+
+
+def test_configurations_of_a_former_version_are_read(tmp_path: Path) -> None:
+    """As commit 4e73c6f wrote them, of runs with --config.densify.every 9, and with --seconds 2: what it
+    wrote of what nobody had said does not count as said."""
+    files = json.loads((Path(__file__).parent / "former_configs.json").read_text())
+    for name, values in files.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(values))
+    said = read_said(tmp_path / "of a length.json")
+    wanted = run_config(iterations=60, method="3dgs", leave_out="photos,growth", max_gaussians=30_000)
+    wanted = replace(wanted, densify=replace(wanted.densify, every=9))
+    assert decided(said) == wanted
+    assert decided(merged(said, {"iterations": 900})) == replace(wanted, iterations=900)
+    assert config_values(decided(said))["densify"] == files["of a length"]["train"]["densify"]
+    assert read_config(tmp_path / "of seconds.json") == run_config(seconds=2.0)
+    longer = options("--config", tmp_path / "of seconds.json", "--iterations", "900")
+    assert config_of(longer) == run_config(iterations=900)
+    (tmp_path / CONFIG).write_text(json.dumps(files["of a length"]))
+    assert RunFolder(tmp_path).loaded["longest"] == 480
+    assert LoadOptions(**RunFolder(tmp_path).loaded).test_every == 8
 
 
 @pytest.mark.parametrize(
@@ -59,20 +86,25 @@ def test_another_length_moves_the_schedule_but_not_what_was_set() -> None:
     assert with_iterations(short, 6000) == run_config(iterations=6000)
     own = replace(short, densify=replace(short.densify, every=7), sh_interval=11)
     longer = with_iterations(own, 6000)
-    assert (longer.densify.every, longer.sh_interval) == (7, 11)
-    assert longer.densify.stop == run_config(iterations=6000).densify.stop
+    assert (longer.due.every, longer.due.sh_interval) == (7, 11)
+    assert longer.due.stop == run_config(iterations=6000).due.stop
+    # A number that is said counts as said, also where it is the one that nobody need say.
+    same = replace(short, densify=replace(short.densify, start=short.due.start))
+    assert with_iterations(same, 6000).due.start == short.due.start != run_config(iterations=6000).due.start
     assert "iterations" in run_config().leave_out
     assert "iterations" not in with_iterations(run_config(), 900).leave_out
 
 
 def test_options_of_the_configuration_go_over_what_the_others_come_to(tmp_path: Path) -> None:
     chosen = options("--iterations", "600", "--config.densify.grad-threshold", "3e-4", "--seed", "5")
-    assert isinstance(chosen, Whole)
     wanted = run_config(iterations=600, seed=5)
-    assert chosen.expert == replace(wanted, densify=replace(wanted.densify, grad_threshold=3e-4))
+    assert config_of(chosen) == replace(wanted, densify=replace(wanted.densify, grad_threshold=3e-4))
+    several = options("--config.hqgs.no-held-pixels", "--config.lr-shN=2", "--config.turn", "3", "40")
+    assert several.numbers == {"hqgs": {"held_pixels": False}, "lr_shN": 2.0, "turn": (3, 40)}
     assert options("--config.densify.grad-threshold", "3e-4", "--overwrite").overwrite
     assert config_of(options()) == run_config()
-    assert config_of(options("--preset", "quick")) == run_config(iterations=PRESETS["quick"].iterations)
+    quick = options("--preset", "quick")
+    assert config_of(quick) == run_config(iterations=PRESETS["quick"].iterations)
     assert config_of(options("--preset", "quick", "--iterations", "50")) == run_config(iterations=50)
     file = tmp_path / "mine.json"
     file.write_text(json.dumps(config_values(wanted)))
@@ -82,11 +114,27 @@ def test_options_of_the_configuration_go_over_what_the_others_come_to(tmp_path: 
     assert config_of(options("--leave-out", "photos,growth")) == run_config(leave_out="photos,growth")
 
 
+def test_a_run_keeps_what_was_said_and_what_was_decided_apart(tmp_path: Path) -> None:
+    """So that one that goes on is that with what is said now, whatever that is."""
+    train(tiny_scene(), out=tmp_path, iterations=3, method="3dgs", max_gaussians=900)
+    kept = json.loads((tmp_path / CONFIG).read_text())
+    assert kept["said"] == {"iterations": 3, "method": "3dgs", "densify": {"max_gaussians": 900}}
+    assert kept["train"] == config_values(run_config(iterations=3, method="3dgs", max_gaussians=900))
+    assert train(tiny_scene(), out=tmp_path, resume=True).iterations == 3  # as it was said
+    run = train(tiny_scene(), out=tmp_path, iterations=6, resume=True)
+    assert (run.iterations, run.report["config"]["method"]) == (6, "3dgs")
+    assert run.report["config"]["densify"]["max_gaussians"] == 900
+    assert json.loads((tmp_path / CONFIG).read_text())["said"] == kept["said"] | {"iterations": 6}
+    with pytest.raises(ValueError, match="--resume can make it longer, not shorter"):
+        train(tiny_scene(), out=tmp_path, iterations=5, resume=True)
+
+
 @pytest.mark.parametrize("seconds", [None, 60.0])
 def test_the_most_that_a_run_might_have_had_can_be_asked_for(tmp_path: Path, seconds: float | None) -> None:
     """config.json has that number although nobody asked for it."""
     file, wanted = tmp_path / CONFIG, run_config(iterations=TrainConfig.iterations)
-    file.write_text(json.dumps(config_values(replace(run_config(), seconds=seconds))))
+    open_ended = replace(run_config(), seconds=seconds)
+    file.write_text(json.dumps({"train": config_values(open_ended)}))
     assert config_of(options("--config", file, "--iterations", str(wanted.iterations))) == wanted
     (tmp_path / CHECKPOINT).touch()
     resumed = Train(scene="photos", out=tmp_path, resume=True, iterations=wanted.iterations)

@@ -361,9 +361,9 @@ def test_an_unknown_method_is_refused_with_the_names() -> None:
         check_method("4dgs")
 
 
-def test_scaled_schedules() -> None:
-    long = TrainConfig().scaled()
+def test_what_is_due_goes_by_the_length() -> None:
+    long, short, shortest = (TrainConfig(iterations=n).due for n in (30_000, 2_100, 100))
     assert (long.sh_interval, long.eval_every, long.checkpoint_every) == (1_000, 3_000, 1_000)
-    short = TrainConfig(iterations=2_100).scaled()
     assert (short.sh_interval, short.eval_every, short.checkpoint_every) == (300, 210, 210)
-    assert short.densify == DensifyConfig().scaled(2_100)
+    assert (shortest.sh_interval, shortest.eval_every, shortest.checkpoint_every) == (14, 50, 10)
+    assert TrainConfig(iterations=2_100).fitted().due == short

@@ -45,12 +45,12 @@ def test_nothing_grows_where_photos_held_back_are_better_for_it(
 ) -> None:
     tried = Tried(gain, 0.4, photos=6, sure=sure)
     plan = plan_run(facts(tried), None, ASKED)
-    densify = plan.settings.densify
+    due = plan.settings.due
     assert (next(row.value for row in plan.rows if row.what == "densification") != "none") == grows
-    assert (densify.start < densify.stop) == grows
+    assert (due.start < due.stop) == grows
     assert f"{gain:+.2f} ± 0.40 dB on 6 validation photos" in told(plan)
     long = plan_run(facts(tried), None, run_config(iterations=7000, method="hqgs", formation="none"))
-    assert (long.settings.densify.reset_every < long.settings.densify.stop) == grows
+    assert (long.settings.densify.reset_every < long.settings.due.stop) == grows
     noisy = replace(ASKED, hqgs=replace(ASKED.hqgs, formation="noise:25"))  # which have a budget of their own
     assert plan_run(facts(tried), None, noisy).settings == plan_run(facts(), None, noisy).settings
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ParamSpec, TypeVar, get_type_hints
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -13,6 +15,9 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 Spec = PrimitiveConstructorSpec[Any]
 Unsaid: Any = tyro.conf.arg(help_behavior_hint="")  # whose words tell the default
 KINDS: dict[Any, str] = {int: "a whole number", float: "a number"}
+P = ParamSpec("P")
+Options = TypeVar("Options")
+Result = TypeVar("Result")
 PLAIN = ConstructorRegistry()  # of how other numbers are read
 
 
@@ -60,3 +65,22 @@ Apart = Annotated[
 ]
 Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
 Flag = Annotated[bool, Unsaid]
+
+
+def called_with(
+    options: Callable[P, Options],
+) -> Callable[[Callable[[Options], Result]], Callable[P, Result]]:
+    """Let a function that takes a dataclass be called with the fields of it, as its signature then says."""
+
+    def decorate(function: Callable[[Options], Result]) -> Callable[P, Result]:
+        @wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> Result:
+            return function(options(*args, **kwargs))
+
+        told, kinds = inspect.signature(options), get_type_hints(options)
+        shown = [given.replace(annotation=kinds[name]) for name, given in told.parameters.items()]
+        result = get_type_hints(function)["return"]
+        vars(call)["__signature__"] = told.replace(parameters=shown, return_annotation=result)
+        return call
+
+    return decorate

@@ -13,21 +13,22 @@ def build(kind: type[T], values: Any, where: str, base: T | None = None) -> T:
     """A dataclass of the values of its fields, objects with fields for the dataclasses within it.
 
     Lists become tuples, and whole numbers floats where the field is one. With `base`: a copy of it, with
-    other values for what `values` names. ValueError, which begins with `where`, for an unknown, missing or
-    mistyped field, and for one that the class refuses.
+    other values for what `values` names. ValueError, which begins with `where` (if that tells anything), for
+    an unknown, missing or mistyped field, and for one that the class refuses.
     """
+    where += ": " if where else ""
     if not isinstance(values, dict):
-        raise ValueError(f"{where}: wanted an object with fields, got {values!r:.60}")
+        raise ValueError(f"{where}wanted an object with fields, got {values!r:.60}")
     hints, known = get_type_hints(kind), [field.name for field in fields(kind)]  # type: ignore[arg-type]
     found: dict[str, Any] = {}
     for name, value in values.items():
         if name not in known:
-            raise ValueError(f"{where}: unknown field {name!r}; there are: {', '.join(known)}")
-        found[name] = _value(hints[name], value, f"{where}: {name}", getattr(base, name, None))
+            raise ValueError(f"{where}unknown field {name!r}; there are: {', '.join(known)}")
+        found[name] = _value(hints[name], value, f"{where}{name}", getattr(base, name, None))
     try:
         return kind(**found) if base is None else replace(base, **found)  # type: ignore[type-var]
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {error}") from error
+        raise ValueError(f"{where}{error}") from error
 
 
 def _value(hint: Any, value: Any, where: str, base: Any = None) -> Any:

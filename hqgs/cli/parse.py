@@ -8,7 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import tyro
 
@@ -38,7 +38,7 @@ POINT = re.compile(r"-[\d.]+(?:e-?\d+)?,")  # one whose first coordinate is nega
 HOME = re.compile(r"^(--[\w-]+=)?(~(?:/.*)?)$", re.DOTALL)  # which the shell leaves as it is after =
 
 
-def parse(options: type[T], command: str, about: str, arguments: Sequence[str], default: Any = None) -> T:
+def parse(options: type[T], command: str, about: str, arguments: Sequence[str]) -> T:
     """The options that the arguments give. Help and mistakes end the program, mistakes with one sentence."""
     if asked := [a for a in arguments if a.split("=")[0] in GPU]:
         raise SystemExit(fail(2, f"there is no {asked[0]}: hqgs runs on the CPU; leave this option out"))
@@ -46,7 +46,6 @@ def parse(options: type[T], command: str, about: str, arguments: Sequence[str], 
         raise SystemExit(fail(2, f"there is no {asked[0]}: write hqgs train PHOTOS --out RUN"))
     arguments = [f" {a}" if POINT.match(a) else a for a in arguments]  # else -1,2,3 would be an option
     arguments = [HOME.sub(lambda m: (m[1] or "") + os.path.expanduser(m[2]), a) for a in arguments]
-    more = {} if default is None else {"default": default}
     told = io.StringIO()
     try:
         with contextlib.redirect_stderr(told):
@@ -57,7 +56,6 @@ def parse(options: type[T], command: str, about: str, arguments: Sequence[str], 
                 args=list(arguments),
                 config=MARKERS,
                 registry=PLAIN,
-                **more,
             )
     except SystemExit as end:
         if not end.code:  # help

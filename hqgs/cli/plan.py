@@ -16,11 +16,11 @@ from hqgs.evaluation.run_folder import RunFolder
 from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.names import KEPT
 from hqgs.scene.photo_files import is_run
-from hqgs.training.config import TrainOptions, longest_side
+from hqgs.training.config import PresetOption, TrainOptions, decided, longest_side
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanOptions(TrainOptions, Photos):
+class PlanOptions(TrainOptions, PresetOption, Photos):
     """Options of `hqgs plan`."""
 
     test_every: Number = None
@@ -35,7 +35,7 @@ OPTIONS = PlanOptions
 def run(options: PlanOptions) -> int:
     """Print the plan; return the exit code (0 done, 2 bad input)."""
     try:
-        config = options.resolved()
+        config = decided(options.said() | ({} if options.preset is None else {"preset": options.preset}))
         posed = options.out is not None and (options.out / KEPT).exists()
         if options.out is not None and not posed and not is_run(options.out):
             raise ValueError(f"--out {options.out}: there is no run; leave --out away to plan a new run")

@@ -30,8 +30,8 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.scene.names import KEPT, is_room
 from hqgs.scene.options import LoadOptions, PhotoOptions
 from hqgs.show.viewer.guard import PORT, check
-from hqgs.training.config import TrainConfig, TrainOptions, longest_side
-from hqgs.training.settings import config_of_values, config_values, read_config, with_plan
+from hqgs.training.config import PresetOption, Said, TrainConfig, TrainOptions, decided, longest_side, merged
+from hqgs.training.settings import read_plan, read_said, resumed
 
 if TYPE_CHECKING:
     from hqgs.pipeline import Run
@@ -48,7 +48,7 @@ class _Into(Photos):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(PhotoOptions, TrainOptions, _Into):
+class Train(PhotoOptions, TrainOptions, PresetOption, _Into):
     """Options of `hqgs train`. Default: as the preset, the file of --config or the resumed run says."""
 
     resume: Flag = False
@@ -67,56 +67,48 @@ class Train(PhotoOptions, TrainOptions, _Into):
     """CPU threads (all cores); the result does not depend on them."""
     help_all: Flag = False
     """Also show the options for every number of the training, such as --config.densify.grad-threshold."""
+    numbers: Annotated[Said, tyro.conf.Suppress] = field(default_factory=dict)
+    """Those of them that were said."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Whole(Train):
-    """All options, with every number of the configuration."""
+    """All options, with every number of the configuration; `numbers` has those that were said."""
 
-    expert: Annotated[TrainConfig, tyro.conf.arg(name="config")] = field(default_factory=TrainConfig)
+    every: Annotated[TrainConfig, tyro.conf.arg(name="config")] = field(default_factory=TrainConfig)
 
 
 OPTIONS = Train
 
 
 def read(options: type[Train], command: str, about: str, arguments: Sequence[str]) -> Train:
-    """As `parse`; options of the configuration change what the other options come to."""
+    """As `parse`, with those numbers of the configuration that the arguments name."""
     if "--help-all" in arguments:
         return parse(Whole, command, about, ["--help"])
-    if not any(argument.startswith(EXPERT) for argument in arguments):
+    named = [argument.split("=")[0][len(EXPERT) :] for argument in arguments if argument.startswith(EXPERT)]
+    if not named:
         return parse(options, command, about, arguments)
-    first = parse(Whole, command, about, arguments)
-    try:
-        base = Whole(scene=first.scene, out=first.out, expert=config_of(first))
-    except BAD_INPUT as error:
-        raise SystemExit(fail(2, error)) from None
-    return parse(Whole, command, about, arguments, base)
+    whole, numbers = parse(Whole, command, about, arguments), dict[str, Any]()
+    for name in named:
+        *parts, last = name.replace("-", "_").split(".")
+        inner, value = numbers, whole.every
+        for part in parts:
+            inner, value = inner.setdefault(part, {}), getattr(value, part)
+        last = last if hasattr(value, last) else last.removeprefix("no_")
+        inner[last] = getattr(value, last)
+    return replace(whole, numbers=numbers)
 
 
-def config_of(options: Train) -> TrainConfig:
-    """The configuration that the options ask for. ValueError for a bad one."""
+def asked_for(options: Train) -> Said:
+    """What the options say of the configuration, and a file or the run that goes on. ValueError."""
     if len(given := [n for n in ("iterations", "seconds", "plan") if getattr(options, n) is not None]) > 1:
         raise ValueError(f"give only one of --{' and --'.join(given)}")
-    before = _before(options)
-    file = options.config or (None if before is None else before.folder)
-    kept = None if file is None else read_config(file)
-    asked = options.resolved(kept)
-    # Where it ends when it no longer pays, or by the clock, the checkpoint alone knows how long the run was.
-    if kept is not None and "iterations" not in kept.leave_out and kept.seconds is None:
-        shorter = asked.iterations < kept.iterations
-        if shorter and before is not None and options.config is None:
-            raise ValueError(
-                f"iterations is {asked.iterations}, and the run in {options.out} has {kept.iterations}: "
-                "--resume can make a run longer, not shorter"
-            )
-    return asked if options.plan is None else with_plan(asked, options.plan)
-
-
-def _before(options: Train) -> RunFolder | None:
-    """The run that goes on."""
-    run = RunFolder(options.out)
-    goes_on = options.resume and run.config and (options.out / CHECKPOINT).exists()
-    return run if goes_on else None
+    now = options.said() | ({} if options.preset is None else {"preset": options.preset})
+    now = now if options.plan is None else merged(now, read_plan(options.plan))
+    now = merged(now, options.numbers)
+    if options.config is not None:
+        return merged(read_said(options.config), now)
+    return resumed(options.out, now) if options.resume else now
 
 
 def run(options: Train) -> int:
@@ -183,8 +175,8 @@ def restarted(out: Path, overwrite: bool, ranks: Ranks) -> bool:
 
 def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingScreen, TrainingScreen, float]:
     """The run, what has shown it, and when its scene was loaded."""
-    config = _checked(options) if ranks.first else None
-    config = config_of_values(ranks.tell(config and config_values(config))[0], "rank 0")
+    said = ranks.tell(_checked(options) if ranks.first else None)[0]
+    config = decided(said)
     if options.threads is not None:
         hqgs.set_num_threads(options.threads)
     elif ranks.local > 1:
@@ -218,7 +210,7 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
         done = hqgs.train(
             scene,
             out=options.out,
-            config=config,
+            config=said,
             resume=options.resume,
             overwrite=options.overwrite,
             progress=show,
@@ -228,27 +220,28 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
     return done, live, screen, bar, loaded
 
 
-def _checked(options: Train) -> TrainConfig:
-    """The configuration of options that can be used."""
-    config = options.expert if isinstance(options, Whole) else config_of(options)
+def _checked(options: Train) -> Said:
+    """What options that can be used say of the configuration."""
+    said = asked_for(options)
+    decided(said)
     parse_degradation(options.degrade or "none")
     for line in check_out(options.out, options.scene, options.resume, options.overwrite):
         print(line, flush=True)
     if options.view:
         check(options.port)
-    return config
+    return said
 
 
 def loading(options: Train, config: TrainConfig) -> dict[str, Any]:
     """What `load_as` is to give, as JSON values; where a run goes on, as it was, but for what is said."""
-    run = _before(options)
-    before = {} if run is None else dict(run.loaded)
+    run = RunFolder(options.out)
+    before = dict(run.loaded) if options.resume and (options.out / CHECKPOINT).exists() else {}
     if options.downscale is not None or options.preset is not None or not before:
         before["longest"] = longest_side(options.preset, options.downscale)
         before.pop("downscale", None)
     unreadable = "photos" in config.leave_out
     path = str(options.scene if is_room(options.scene) else Path(options.scene).expanduser().resolve())
-    said = options.said() | {"path": path, "seed": config.seed, "skip_unreadable": unreadable}
+    said = options.of_photos() | {"path": path, "seed": config.seed, "skip_unreadable": unreadable}
     return before | said
 
 

@@ -42,7 +42,7 @@ class PhotoOptions:
     restore: Annotated[Path | None, tyro.conf.arg(metavar="WEIGHTS"), Unsaid] = None
     """Restore the training photos with this network first (a file of weights)."""
 
-    def said(self) -> dict[str, Any]:
+    def of_photos(self) -> dict[str, Any]:
         """Those that were said, as JSON values."""
         given = {field.name: getattr(self, field.name) for field in fields(PhotoOptions)}
         if given["restore"] is not None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import tyro
 
 from hqgs.base.options import Number, Seconds, Seed, Unsaid, choice
+from hqgs.base.typed import build
 from hqgs.model.constants import MAX_SH_DEGREE
 from hqgs.photos.formula import parse_formation
 from hqgs.scene.constants import BACKGROUND
@@ -28,9 +30,11 @@ ITEMS = {
 }
 ASKED_FOR = ("resolution", "iterations")  # automatic only where a run's start, or no number, asks for it
 AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
-LEFT = ("passersby", "weight")  # items of former versions, which configurations may still name
 STANDARD = "standard"
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
+Said: TypeAlias = dict[str, Any]  # fields of `TrainConfig` that somebody has said, parts as such, and preset
+PART = {"max_gaussians": "densify", "guidance": "hqgs", "formation": "hqgs"}  # where options are fields
+LENGTHS = {"iterations", "seconds", "turn", "timed"}  # each says how long a run is, in place of the others
 
 
 @dataclass(frozen=True)
@@ -73,15 +77,15 @@ def check_method(name: str) -> None:
 
 
 def _at_least(config: object, least: int, *names: str) -> None:
-    """ValueError for the first of these fields that is below `least`, or no number."""
+    """ValueError for the first of these fields that is said and below `least`, or no number."""
     for name in names:
-        if not getattr(config, name) >= least:
-            raise ValueError(f"{name} is {getattr(config, name)}, wanted at least {least}")
+        if (value := getattr(config, name)) is not None and not value >= least:
+            raise ValueError(f"{name} is {value}, wanted at least {least}")
 
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """When and how densely Gaussians are added and removed. The defaults are those of 3DGS at 30,000.
+    """When and how densely Gaussians are added and removed; None: by the run's length (`TrainConfig.due`).
 
     Pruning by size on the screen (20 px in the paper's code) is left out: there it tests radii that were
     just set to zero, so that no published figure contains it. Pruning by size in the world goes by the
@@ -89,9 +93,9 @@ class DensifyConfig:
     that is far away, in each round.
     """
 
-    start: int = 500  # iterations before the first round
-    stop: int = 15_000  # no round and no reset from this iteration on
-    every: int = 100  # iterations between rounds
+    start: int | None = None  # iterations before the first round
+    stop: int | None = None  # no round and no reset from this iteration on
+    every: int | None = None  # iterations between rounds
     grad_threshold: float = 2e-4  # mean gradient norm of the 2D mean, in half images, that calls for growth
     percent_dense: float = 0.01  # of the scene extent: smaller Gaussians are cloned, larger ones split
     prune_opacity: float = 0.005  # more transparent Gaussians are removed
@@ -106,20 +110,6 @@ class DensifyConfig:
         for name in ("prune_opacity", "reset_opacity"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted a value between 0 and 1")
-
-    def scaled(self, iterations: int) -> DensifyConfig:
-        """The schedule for a run of another length than 30,000.
-
-        Growth ends after two thirds of the run, at 15,000 at the latest. A short run starts it sooner and has
-        its rounds closer together. Resets keep their interval: a run that ends growth before the first one
-        has none, since it would have no time to recover (it costs 3 dB at 2,000 iterations).
-        """
-        return replace(
-            self,
-            start=min(self.start, iterations // 14),
-            stop=min(self.stop, iterations * 2 // 3),
-            every=min(self.every, max(1, iterations // 20)),
-        )
 
 
 @dataclass(frozen=True)
@@ -157,12 +147,22 @@ class HQGSConfig:
             raise ValueError(f"first_points is {self.first_points}, wanted 0 to 1")
 
 
+class Due(NamedTuple):
+    """When things are due in a run, iterations: what was said of them, and the rest by its length."""
+
+    sh_interval: int
+    eval_every: int
+    checkpoint_every: int
+    start: int  # of growth, as the next two
+    stop: int
+    every: int
+
+
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything but the photos that a result depends on.
+    """Everything but the photos that a result depends on. None: not said, so that the plan decides.
 
-    `scaled()` fits the schedule to a run of another length than 30,000 iterations. `run_config` makes the
-    configuration of a run as a user asks for it.
+    `run_config` makes the configuration of a run as a user asks for it.
     """
 
     iterations: int = 30_000  # training views seen
@@ -173,7 +173,7 @@ class TrainConfig:
     timed: bool | None = None  # whether the length is what a number of seconds came to in another run
     batch: int = 1  # views in a step, at most
     sh_degree: int = MAX_SH_DEGREE  # of the spherical harmonics, at most
-    sh_interval: int = 1_000  # iterations until the next SH degree is trained
+    sh_interval: int | None = None  # iterations until the next SH degree is trained
     lr_means: float = 1.6e-4  # times the scene extent (`learning_rates`: or more); falls exponentially to
     lr_means_final: float = 1.6e-6  # this at the end of the run
     lr_scales: float = 5e-3
@@ -185,14 +185,12 @@ class TrainConfig:
     start_points: int = 100_000  # to start from at most (twice that in short runs) where photos agree on more
     opacity_decay: float | None = None  # share of the opacities that each view takes away; None: by the plan
     dropout: float | None = None  # share of Gaussians left out of a step, at the end; None: likewise
-    averaged: float | None = (
-        None  # share of the steps, the last ones, whose mean is the scene; None: likewise
-    )
+    averaged: float | None = None  # share of the steps, the last ones, whose mean is shown; None: likewise
     adam_eps: float = 1e-15
     leave_out: tuple[str, ...] = AUTOMATIC  # of ITEMS: what the run may do without, where it pays
     background: tuple[float, float, float] = BACKGROUND  # RGB
-    eval_every: int = 3_000  # iterations between evaluations on the held-out views
-    checkpoint_every: int = 1_000  # iterations; does not change the result
+    eval_every: int | None = None  # iterations between evaluations on the held-out views
+    checkpoint_every: int | None = None  # iterations; does not change the result
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     srgs: SRGSConfig = field(default_factory=SRGSConfig)  # of the method of that name, as the next
     hqgs: HQGSConfig = field(default_factory=HQGSConfig)
@@ -215,29 +213,46 @@ class TrainConfig:
             if name.startswith("lr_") and not 0 < value < math.inf:
                 raise ValueError(f"{name} is {value}, wanted a positive number")
 
-    def scaled(self) -> TrainConfig:
-        """The same run with the schedule fitted to `iterations`; see `DensifyConfig.scaled` too.
+    @cached_property
+    def due(self) -> Due:
+        """When things are due: as 3DGS has it in 30,000 iterations, sooner in a shorter run.
 
-        The SH degrees come in within three sevenths of a short run. Evaluates 10 times; saves every 1,000
-        iterations, in short runs 10 times.
+        The SH degrees come in within three sevenths of it. Growth ends after two thirds, begins sooner and
+        has its rounds closer together; opacity resets keep their interval: a run that ends growth before the
+        first one has none, since it would have no time to recover (it costs 3 dB at 2,000 iterations).
         """
-        tenth = math.ceil(self.iterations / 10)
-        return replace(
-            self,
-            sh_interval=min(self.sh_interval, max(1, self.iterations // 7)),
-            eval_every=tenth,
-            checkpoint_every=min(self.checkpoint_every, tenth),
-            densify=self.densify.scaled(self.iterations),
+        length, tenth = self.iterations, math.ceil(self.iterations / 10)
+        fitted = Due(
+            sh_interval=min(1_000, max(1, length // 7)),
+            eval_every=max(tenth, 50),
+            checkpoint_every=min(1_000, tenth),
+            start=min(500, length // 14),
+            stop=min(15_000, length * 2 // 3),
+            every=min(100, max(1, length // 20)),
         )
+        said = {name: (vars(self) | vars(self.densify))[name] for name in Due._fields}
+        return fitted._replace(**{name: value for name, value in said.items() if value is not None})
+
+    def fitted(self) -> TrainConfig:
+        """With the numbers of `due` written out."""
+        due = self.due._asdict()
+        growth = {name: due.pop(name) for name in ("start", "stop", "every")}
+        return replace(self, **due, densify=replace(self.densify, **growth))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PresetOption:
+    """What the command line has beside `TrainOptions`: it is of the photos' size, too."""
+
+    preset: Annotated[str | None, choice(*PRESETS), Unsaid] = None
+    """quick: 1,000 iterations on small photos, for a first look. standard (the default): until the scene
+    stops improving, photos of at most 1600 px. best: 30,000 iterations, photos at full size."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
     """What a user says of a run, as `hqgs.train` and the command line take it; None: not said."""
 
-    preset: Annotated[str | None, choice(*PRESETS), Unsaid] = None
-    """quick: 1,000 iterations on small photos, for a first look. standard (the default): until the scene
-    stops improving, photos of at most 1600 px. best: 30,000 iterations, photos at full size."""
     iterations: Number = None
     """Number of training views to render (standard: 150 for each photo, from 4,000 to 30,000; fewer if the
     scene stops improving)."""
@@ -268,66 +283,52 @@ class TrainOptions:
     seed: Seed = None
     """Seed of all random numbers (0)."""
 
-    def resolved(self, before: TrainConfig | None = None) -> TrainConfig:
-        """The configuration that is meant; `before`: of the run that goes on, or is done alike.
-
-        What is not said is as it was before, or as the preset has it. "auto" leaves iterations out where
-        nobody has said how many. ValueError for a name that there is not, or a number out of range.
-        """
-        length = self.iterations
-        if before is None and length is None:
-            length = PRESETS[self.preset or STANDARD].iterations
-        open_end = length is None and (before is None or "iterations" in before.leave_out)
-        config = before or scaled(
-            TrainConfig(iterations=TrainConfig.iterations if length is None else length)
-        )
-        if length is not None and before is not None:
-            known = "iterations" not in before.leave_out and before.seconds is None
-            if length != before.iterations or not known:
-                config = replace(with_iterations(before, length), seconds=None, turn=None, timed=None)
-        changes: dict[str, Any] = {
-            name: value
-            for name in ("batch", "seconds", "method", "eval_every", "seed")
-            if (value := getattr(self, name)) is not None
-        }
-        if self.leave_out is not None or before is None:
-            items = parse_leave_out(self.leave_out or AUTO)
-            open_end = open_end and self.leave_out in (None, AUTO)
-            changes["leave_out"] = (*items, "iterations") if open_end else items
-        if self.max_gaussians is not None:
-            changes["densify"] = replace(config.densify, max_gaussians=self.max_gaussians)
-        of_hqgs = {"guidance": self.guidance, "formation": self.formation}
-        of_hqgs = {name: value for name, value in of_hqgs.items() if value is not None}
-        return replace(config, hqgs=replace(config.hqgs, **of_hqgs), **changes)
+    def said(self) -> Said:
+        """What was said, by the names that it has in `TrainConfig`."""
+        found: Said = {}
+        for option in fields(TrainOptions):
+            if (value := getattr(self, option.name)) is not None:
+                part = PART.get(option.name)
+                (found if part is None else found.setdefault(part, {}))[option.name] = value
+        return found
 
 
 def run_config(**said: Any) -> TrainConfig:
     """The configuration of a run of these `TrainOptions`."""
-    return TrainOptions(**said).resolved()
+    return decided(TrainOptions(**said).said())
 
 
-def scaled(config: TrainConfig) -> TrainConfig:
-    """With its schedule fitted to its length, and evaluations at least 50 iterations apart."""
-    config = config.scaled()
-    return replace(config, eval_every=max(config.eval_every, 50))
+def merged(before: Said, now: Said) -> Said:
+    """What was said before, and what is said now, which goes over it."""
+    if LENGTHS & now.keys():
+        before = {name: value for name, value in before.items() if name not in LENGTHS}
+    within = {
+        name: before[name] | value
+        for name, value in now.items()
+        if isinstance(value, dict) and isinstance(before.get(name), dict)
+    }
+    return before | now | within
+
+
+def decided(said: Said, where: str = "") -> TrainConfig:
+    """The configuration of what was said, `where`. ValueError that names what cannot be.
+
+    What is not said is as the preset has it. "auto" leaves iterations out where nobody has said how many.
+    """
+    values = {"preset": STANDARD, "leave_out": AUTO} | said
+    if (preset := PRESETS.get(str(values.pop("preset")))) is None:
+        raise ValueError(f"{where}: preset is {said['preset']!r}, wanted one of: {', '.join(PRESETS)}")
+    values.setdefault("iterations", preset.iterations)
+    if open_end := values["iterations"] is None:
+        values["iterations"] = TrainConfig.iterations
+    if isinstance(items := values["leave_out"], str):
+        values["leave_out"] = parse_leave_out(items) + (("iterations",) if items == AUTO and open_end else ())
+    if values.get("timed"):  # nothing but the recorded length ends it
+        values["leave_out"] = tuple(item for item in values["leave_out"] if item != "iterations")
+    return build(TrainConfig, values, where)
 
 
 def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
-    """The configuration for a run of another length; what the user has set of its schedule stays.
-
-    It trains all of that length: the item "iterations" is not left out.
-    """
-    before, after = (scaled(TrainConfig(iterations=length)) for length in (config.iterations, iterations))
-
-    def fitted(mine: Any, old: Any, new: Any, *names: str) -> dict[str, Any]:
-        same = [name for name in names if getattr(mine, name) == getattr(old, name)]
-        return {name: getattr(new, name) for name in same}
-
-    growth = fitted(config.densify, before.densify, after.densify, "start", "stop", "every")
-    return replace(
-        config,
-        iterations=iterations,
-        leave_out=tuple(item for item in config.leave_out if item != "iterations"),
-        densify=replace(config.densify, **growth),
-        **fitted(config, before, after, "sh_interval", "eval_every", "checkpoint_every"),
-    )
+    """The configuration for a run of another length, all of which is trained: "iterations" is no item."""
+    items = tuple(item for item in config.leave_out if item != "iterations")
+    return replace(config, iterations=iterations, leave_out=items)

@@ -37,7 +37,7 @@ def by_held_photos(schedule: Schedule, state: TrainState, psnr: Callable[[], flo
             left = f"iterations {length + 1} to {total}"
             row = PlanRow("length", f"{length:,} iterations", why, told, "iterations", iteration, left)
             state.rows.append(row)
-    if iteration == schedule.config.densify.stop:
+    if iteration == schedule.config.due.stop:
         decisions = replace(decisions, released=iteration)
     if decisions.released:
         why = "the scene needs them where no other photo looks"

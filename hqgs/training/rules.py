@@ -360,24 +360,24 @@ def half_size_end(iterations: int) -> int:
 
 
 def growth(draft: Draft) -> None:
-    densify, tried, told = draft.settings.densify, draft.facts.tried, ""
+    due, tried, told = draft.settings.due, draft.facts.tried, ""
     if tried is not None:
         told = f"without it {tried}; mean gain of PSNR, SSIM and HaarPSI: {tried.sure:.1f} standard errors"
     dense = draft.undegraded and draft.dense
     left, why = None, "the schedule of 3DGS, scaled to the length of the run"
     if dense and tried is not None and tried.pays:
-        draft.grow(**no_growth(densify))
+        draft.grow(**no_growth(draft.settings))
         why = "in short test runs added Gaussians overfitted the photos: validation photos became worse"
         draft.note("none", why, told, "densification")
         return
-    if dense and densify.start < GROWS_FROM:
+    if dense and due.start < GROWS_FROM:
         draft.grow(start=GROWS_FROM)
         why = "gradients show missing detail only after sizes and colours are about right"
         left = f"densification in the first {GROWS_FROM} iterations"
-    start, stop, every = draft.settings.densify.start, densify.stop, densify.every
-    draft.note(f"every {every} iterations from {start:,} to {stop:,}", why, told, left)
-    if draft.formed and not draft.undegraded and densify.reset_every < stop:
-        draft.grow(reset_every=stop)
+    start = draft.settings.due.start
+    draft.note(f"every {due.every} iterations from {start:,} to {due.stop:,}", why, told, left)
+    if draft.formed and not draft.undegraded and draft.settings.densify.reset_every < due.stop:
+        draft.grow(reset_every=due.stop)
         what = "opacity resets"  # what one takes away seldom comes back where it was
         draft.note("none", "with a limit on Gaussians, lost ones do not come back", left_out=what, what=what)
 
@@ -534,9 +534,9 @@ def growth_in_doubt(facts: Facts, plan: RunPlan) -> bool:
     return draft.undegraded and draft.dense and not in_agreement(facts)
 
 
-def no_growth(growth: DensifyConfig) -> dict[str, int]:
-    """The fields of a schedule by which nothing grows, and nothing is removed."""
-    return {"start": growth.stop, "reset_every": max(1, growth.stop)}
+def no_growth(settings: TrainConfig) -> dict[str, int]:
+    """The fields of growth by which nothing grows, and nothing is removed."""
+    return {"start": settings.due.stop, "reset_every": max(1, settings.due.stop)}
 
 
 def first_points_wanted(facts: Facts, settings: TrainConfig) -> int:

@@ -77,21 +77,21 @@ class Schedule:
     def plan(self, iteration: int, decisions: Decisions) -> StepPlan:
         """What step number `iteration` (1, 2, ...) does."""
         config, before = self.config, iteration - 1
-        densify, stop = config.densify, self.densification_end(decisions)
+        due, stop = config.due, self.densification_end(decisions)
         coarse, part = self.is_coarse(iteration), self.part(iteration, decisions)
         finest = FINEST * (COARSE_FACTOR if coarse else 1) if "growth" in config.leave_out else None
         return StepPlan(
             iteration=iteration,
             # Not after the step that it is due at: what is looked at or written in between is the scene
             # before its opacities are cut, and a run that ends there keeps it.
-            resets=0 < before < stop and before % densify.reset_every == 0,
+            resets=0 < before < stop and before % config.densify.reset_every == 0,
             view=self.view(iteration, decisions),
             coarse=coarse,
             part=part,
             degree=self.degree(iteration),
             dropout=(config.dropout or 0.0) * part,
             observes=iteration < stop,
-            densifies=densify.start < iteration < stop and iteration % densify.every == 0,
+            densifies=due.start < iteration < stop and iteration % due.every == 0,
             finest=finest,
             averages=iteration >= stop and part > 1 - (config.averaged or 0.0),
         )
@@ -113,7 +113,7 @@ class Schedule:
     def _pauses(self, plan: StepPlan, decisions: Decisions) -> bool:
         """Whether something is due, or may be decided, after this plan's view."""
         iteration, densification_end = plan.iteration, self.densification_end(decisions)
-        due = {decisions.length, densification_end, self.config.densify.stop, self.run.half_size_until}
+        due = {decisions.length, densification_end, self.config.due.stop, self.run.half_size_until}
         due.add(self.turn_at(decisions))
         return (
             plan.densifies
@@ -152,14 +152,14 @@ class Schedule:
 
     def degree(self, iteration: int) -> int:
         """Of the harmonics that are trained: it rises with the iterations."""
-        interval = self.config.sh_interval
+        interval = self.config.due.sh_interval
         if "growth" in self.config.leave_out and self.config.iterations > 3_000:
             interval = min(interval, max(1, self.config.iterations // 20))
         return min(self.config.sh_degree, iteration // interval)
 
     def densification_end(self, decisions: Decisions) -> int:
         """The iteration from which on nothing grows; a shortened run ends growth sooner."""
-        stop = self.config.densify.stop
+        stop = self.config.due.stop
         if decisions.length == self.config.iterations or decisions.turned:
             return stop
         return min(stop, math.ceil((1 + REST / 2) * decisions.released))

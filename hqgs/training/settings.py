@@ -1,65 +1,100 @@
-"""Configurations in files."""
+"""What was said of a run, in files: config.json and plan.json of a run, or fields of `TrainConfig` alone."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hqgs.base.files import PLAN, read_json
-from hqgs.base.typed import build
-from hqgs.training.config import LEFT, TrainConfig, with_iterations
+from hqgs.base.files import CHECKPOINT, CONFIG, PLAN, read_json
+from hqgs.training.config import AUTO, AUTOMATIC, Said, TrainConfig, decided, merged
+
+LEFT = {"passersby", "weight"}  # items of former versions, which configurations may still name
 
 
 def config_values(config: TrainConfig) -> dict[str, Any]:
-    """A configuration as JSON values, as `read_config` takes it."""
-    return json.loads(json.dumps(asdict(config)))
+    """A configuration as JSON values, whole: with the numbers of `TrainConfig.due`."""
+    return json.loads(json.dumps(asdict(config.fitted())))
 
 
-def read_config(path: str | Path) -> TrainConfig:
-    """The configuration in a file: config.json of a run, or the fields of `TrainConfig` alone.
+def said_by(config: TrainConfig) -> Said:
+    """A configuration as what somebody has said: all of it, but for what it leaves to the plan."""
+    known = {name: value for name, value in vars(config).items() if value is not None and name != "due"}
+    parts = ("densify", "srgs", "hqgs")
+    return known | {p: {k: v for k, v in vars(known[p]).items() if v is not None} for p in parts}
 
-    Fields that are missing have their defaults. FileNotFoundError, or ValueError that names the field.
+
+def read_said(path: str | Path) -> Said:
+    """What a file says: config.json of a run, of a former version too, or some fields of `TrainConfig`.
+
+    FileNotFoundError, or ValueError that names the field.
     """
-    path = Path(path)
-    if path.is_dir():
-        path = path / "config.json"
+    path = Path(path) / CONFIG if Path(path).is_dir() else Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no configuration {path}")
     values = read_json(path)
-    if isinstance(values, dict) and isinstance(values.get("train"), dict):
-        values = values["train"]
-    return config_of_values(values, str(path))
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: wanted an object with fields, got {values!r:.60}")
+    said, train = (values.get(name) for name in ("said", "train"))
+    if not isinstance(said, dict):
+        said = _said_once(train if isinstance(train, dict) else values)
+    decided(said, str(path))
+    return said
 
 
-def config_of_values(values: Any, where: str) -> TrainConfig:
-    """The configuration of JSON values, of `where`. ValueError that names the field."""
-    if isinstance(values, dict):  # of a former version too
-        if isinstance(items := values.get("leave_out"), list):
-            values = values | {"leave_out": [item for item in items if item not in LEFT]}
-        if isinstance(hqgs := values.get("hqgs"), dict):
-            values = values | {"hqgs": {name: value for name, value in hqgs.items() if name != "paper"}}
-    return build(TrainConfig, values, where)
+def _said_once(values: Said) -> Said:
+    """What was said, as far as these fields tell it, which config.json of former versions has all of.
+
+    What the length decides was not said there, nor was a length beyond which nothing paid.
+    """
+    said = {name: value for name, value in values.items() if value is not None}
+    if isinstance(said.get("hqgs"), dict):
+        said["hqgs"] = {name: value for name, value in said["hqgs"].items() if name != "paper"}
+    length, items = said.get("iterations"), said.get("leave_out")
+    if isinstance(items, list):
+        items = said["leave_out"] = [item for item in items if item not in LEFT]
+        if "iterations" in items and length == TrainConfig.iterations:
+            del said["iterations"]
+            if {*items} == {*AUTOMATIC, "iterations"}:
+                said["leave_out"] = AUTO
+    if type(length) is int and length > 0:
+        for name, value in TrainConfig(iterations=length).due._asdict().items():
+            for part in (said, said.get("densify")):
+                if isinstance(part, dict) and part.get(name) == value:
+                    del part[name]
+    return said
+
+
+def resumed(folder: Path, now: Said) -> Said:
+    """What is said of the run in a folder, before and now. ValueError where it would be shorter."""
+    before = read_said(folder) if (folder / CHECKPOINT).exists() and (folder / CONFIG).is_file() else {}
+    said = merged(before, now)
+    if "iterations" in before and "iterations" in now and said["iterations"] < before["iterations"]:
+        raise ValueError(
+            f"iterations is {said['iterations']}, and the run in {folder} has {before['iterations']}: "
+            "--resume can make it longer, not shorter"
+        )
+    return said
 
 
 def plan_values(config: TrainConfig, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How long the run of these settings was, as JSON values, which `with_plan` reads; and its rows."""
+    """How long the run of these settings was, as JSON values, which `read_plan` reads; and its rows."""
     turn = None if config.turn is None else list(config.turn)
     return {"iterations": config.iterations, "turn": turn, "rows": list(rows)}
 
 
-def with_plan(config: TrainConfig, path: str | Path) -> TrainConfig:
-    """The configuration with the length that a run with a number of seconds came to: plan.json, or the run's
-    folder. FileNotFoundError, or ValueError that says what is wrong with it."""
+def read_plan(path: str | Path) -> Said:
+    """The length that a run with a number of seconds came to, as what somebody has said: of plan.json, or of
+    the run's folder. FileNotFoundError, or ValueError that says what is wrong with it."""
     path = Path(path) / PLAN if Path(path).is_dir() else Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no plan {path}; runs with a number of seconds write one")
     try:
         plan = json.loads(path.read_text(encoding="utf-8"))
-        iterations, turn = plan["iterations"], plan["turn"]
-        turn = None if turn is None else (int(turn[0]), int(turn[1]))
-        return replace(with_iterations(config, int(iterations)), seconds=None, turn=turn, timed=True)
+        said: Said = {"iterations": int(plan["iterations"]), "turn": plan["turn"], "timed": True}
+        decided(said)
     except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         raise ValueError(f"{path} is no plan: {error!r}") from error
+    return said

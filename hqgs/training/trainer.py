@@ -204,7 +204,7 @@ class Trainer:
         `views`: what to measure; None: all at the end of the run, and what `on_the_way` says before it.
         """
         if views is None:
-            some = on_the_way(self.scene, self.config.eval_every)
+            some = on_the_way(self.scene, self.config.due.eval_every)
             views = self.held_out(None if self.iteration >= self.length else some)
         of = len(self.scene.test)
         if self.history and self.history[-1]["iteration"] == self.iteration:

@@ -26,10 +26,9 @@ from hqgs.evaluation.metrics import haarpsi, psnr_aligned, ssim
 from hqgs.photos.formula import NONE, parse_formation
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import Scene
-from hqgs.training.config import TrainConfig
+from hqgs.training.config import TrainConfig, with_iterations
 from hqgs.training.plan import RunPlan, Tried
 from hqgs.training.rules import MANY_PHOTOS, no_growth
-from hqgs.training.settings import with_iterations
 
 LOOKS = "exposure", "vignetting", "response"  # that small copies show, in the order in which they are tried
 EACH, OFFSETS = 4, (1, 3)  # every so-manieth photo is held back, from these on, one after the other
@@ -67,7 +66,7 @@ def calls_for_trial(scene: Scene, plan: RunPlan) -> bool:
     pixels leaves too small ones.
     """
     settings, views = plan.settings, scene.train
-    if settings.densify.stop <= settings.densify.start or len(views) <= EACH or not len(scene.points):
+    if settings.due.stop <= settings.due.start or len(views) <= EACH or not len(scene.points):
         return False
     return _side(scene, settings.iterations) >= SIDES[0]
 
@@ -85,7 +84,7 @@ def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = 
         most = min(growth.max_gaussians, max(pixels // PIXELS, trainer.plan.first_points))
         grown, still = (
             _values(trainer, densify=replace(growth, **changes))
-            for changes in ({"max_gaussians": most}, no_growth(growth))
+            for changes in ({"max_gaussians": most}, no_growth(trainer.plan.settings))
         )
         found.append(still - grown)
         if found[-1][:, 0].max(initial=-np.inf) < 0:  # all of the first are worse: others do not turn it
