@@ -98,7 +98,7 @@ def test_how_often_a_run_of_seconds_is_saved_stays_as_it_was_planned(tmp_path: P
     fit_to_seconds(trainer)
     trainer.save(tmp_path / CHECKPOINT)
     again = Trainer(tiny_scene(), trainer.asked)
-    assert again.config.eval_every != trainer.config.eval_every  # no step was timed
+    assert again.config.due.eval_every != trainer.config.due.eval_every  # no step was timed
     again.restore(tmp_path / CHECKPOINT)
     assert again.config == trainer.config
 

@@ -17,6 +17,7 @@ Unsaid: Any = tyro.conf.arg(help_behavior_hint="")  # whose words tell the defau
 KINDS: dict[Any, str] = {int: "a whole number", float: "a number"}
 P = ParamSpec("P")
 Options = TypeVar("Options")
+T = TypeVar("T")
 Result = TypeVar("Result")
 PLAIN = ConstructorRegistry()  # of how other numbers are read
 
@@ -47,6 +48,11 @@ def plain(info: PrimitiveTypeInfo) -> Spec | None:
     """A number."""
     kind: Any = info.type
     return values(kind.__name__.upper(), KINDS[kind], kind) if kind in KINDS else None
+
+
+def given(value: T | None, default: T) -> T:
+    """What was said, or else this."""
+    return default if value is None else value
 
 
 Number = Annotated["int | None", values("N", "a whole number", int), Unsaid]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from hqgs.base.evenly import evenly
+from hqgs.base.options import called_with, given
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import as_text, some
 from hqgs.photos import profiles
@@ -19,7 +20,7 @@ from hqgs.scene import masks
 from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, odd_lenses, photo_folder
 from hqgs.scene.checks import broken, elsewhere, nothing
-from hqgs.scene.constants import BACKGROUND, COPY_SIDE, MOST_BYTES
+from hqgs.scene.constants import BACKGROUND, COPY_SIDE, MOST_BYTES, TEST_EVERY
 from hqgs.scene.faces import CUBE, around, faces_of
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import find_models, find_models_below, half_model, read_colmap
@@ -28,6 +29,7 @@ from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.names import existing_folder
+from hqgs.scene.options import LoadOptions
 from hqgs.scene.place import cut_outs, located, placed, without_missing, without_poseless, without_strays
 from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, TrackStatistics, View
@@ -39,17 +41,16 @@ from hqgs.scene.wide import with_faces
 COLMAP = "colmap"
 
 
-def load_scene(
-    path: str | Path,
-    downscale: float = 1.0,
-    test_every: int = 8,
-    skip_unreadable: bool = False,
-    keep_sfm: Path | None = None,
-    longest: int | None = None,
-    on_stage: OnStage = silent,
-    sfm: bool = False,
-    coarse: bool | None = None,
-) -> Scene:
+@dataclass(frozen=True, kw_only=True)
+class FolderCall(LoadOptions):
+    """The arguments of `load_scene`."""
+
+    keep_sfm: Path | None = None
+    on_stage: OnStage = silent
+
+
+@called_with(FolderCall)
+def load_scene(asked: FolderCall) -> Scene:
     """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
 
     The format is recognised in this order: a COLMAP model with photos (`sparse/0`, `sparse`, or the folder
@@ -78,76 +79,85 @@ def load_scene(
 
     Raises FileNotFoundError for a missing folder or photo, ValueError for anything else that is wrong.
     """
-    root, inside = scene_folder(path)
+    root, notes = scene_folder(asked.path)
+    downscale, test_every = given(asked.downscale, 1.0), given(asked.test_every, TEST_EVERY)
     if not (math.isfinite(downscale) and downscale >= 1):
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
-    search = Search(keep_sfm, on_stage, coarsely(longest, coarse))
-    capture = with_faces(_read(root, downscale, sfm, search))
-    if longest is not None:
-        capture = bounded(capture, longest)
+    search = Search(asked.keep_sfm, asked.on_stage, coarsely(asked.longest, asked.coarse))
+    capture = with_faces(_read(root, downscale, asked.sfm, search))
+    capture = capture if asked.longest is None else bounded(capture, asked.longest)
     degraded = read_degraded_folder(root)
-    if degraded is not None:
-        capture = replace(capture, notes=[*degraded.notes, *capture.notes])
-    notes = [*inside, *capture.notes, *masks.told(root, capture), *odd_lenses(capture)]
+    notes += [] if degraded is None else degraded.notes
+    notes += [*capture.notes, *masks.told(root, capture), *odd_lenses(capture)]
     if capture.source != "photos":  # those were told of when they were looked at
         notes += profiles.told({photo.name: told_colors(photo.path) for photo in capture.photos})
-    test_names = held_out_names(root, capture, test_every, notes, degraded)
+    held_out = held_out_names(root, capture, test_every, notes, degraded)
     capture = without_poseless(root, without_missing(root, capture, notes), notes)
     capture = placed(without_strays(capture, notes), notes)
     capture = replace(capture, photos=masks.with_turns(capture.photos, notes))
+    views = _views(root, capture, asked, degraded if downscale == 1 else None, held_out, notes)
+    train = [view for view in views if view.name not in held_out]
+    points, colors = capture.points.astype(np.float64), capture.point_colors
+    if guessed := len(points) == 0:
+        points, colors, note = random_points(train, capture.near_far)
+        notes.append(note)
+    if (place := located(capture)) is not None:
+        notes.append(str(place))
+    return Scene(
+        root.name,
+        train,
+        [view for view in views if view.name in held_out],
+        points,
+        colors,
+        capture.source,
+        notes,
+        _tracks(capture, views),
+        capture.seen,
+        capture.sfm,
+        world=replace(capture.world, place=place),
+        guessed=guessed,
+    )
+
+
+def _views(
+    root: Path,
+    capture: Capture,
+    asked: FolderCall,
+    degraded: DegradedFolder | None,
+    held_out: frozenset[str],
+    notes: list[str],
+) -> list[View]:
+    """The photos, decoded; `degraded`: where small ones are. `notes` hears of those that cannot be used.
+
+    ValueError where too few are left to train on, or to measure with.
+    """
     names = frozenset(photo.name for photo in capture.photos)
-    optional = names if skip_unreadable else frozenset[str]()
+    optional = names if asked.skip_unreadable else frozenset[str]()
     over = BACKGROUND if cut_outs(capture) else None
-    views, unreadable = load_views(capture.photos, capture.downscale, optional, on_stage, over)
+    views, unreadable = load_views(capture.photos, capture.downscale, optional, asked.on_stage, over)
     if any(view.empty is not None for view in views):
         notes.append(
             f"the {len(views)} photos have transparent pixels, which are black in photos and renders"
         )
-    if degraded is not None and downscale == 1:
+    if degraded is not None:
         views = _with_lows(views, degraded, root, optional, unreadable)
     if capture.source == "transforms" and not len(capture.points):
         views, turned = with_true_axes(views)
         notes += [] if turned is None else [turned]
-    train = [v for v in views if v.name not in test_names]
-    test = [v for v in views if v.name in test_names]
-    if not names - test_names:
+    if not names - held_out:
         raise ValueError(f"{root}: all {len(views)} photos are held out, none is left to train on")
-    for kept, those, what in (
-        (train, names - test_names, "training"),
-        (test, names & test_names, "held-out"),
-    ):
+    for those, what in ((names - held_out, "training"), (names & held_out, "held-out")):
         gone = {name: unreadable[name] for name in those if name in unreadable}
-        if len(kept) < len(gone):
+        if len(those) < 2 * len(gone):
             raise gone[min(gone)]
         if gone:
             notes.append(
                 f"{len(gone)} of {len(those)} {what} photos cannot be used and were left out: "
                 f"{some(sorted(gone))}. The first: {gone[min(gone)]}"
             )
-    points, colors = capture.points.astype(np.float64), capture.point_colors
-    guessed = len(points) == 0
-    if guessed:
-        points, colors, note = random_points(train, capture.near_far)
-        notes.append(note)
-    tracks = _tracks(capture, views)
-    if (place := located(capture)) is not None:
-        notes.append(str(place))
-    return Scene(
-        root.name,
-        train,
-        test,
-        points,
-        colors,
-        capture.source,
-        notes,
-        tracks,
-        capture.seen,
-        capture.sfm,
-        world=replace(capture.world, place=place),
-        guessed=guessed,
-    )
+    return views
 
 
 def coarsely(longest: int | None, coarse: bool | None = None) -> bool:
@@ -156,7 +166,11 @@ def coarsely(longest: int | None, coarse: bool | None = None) -> bool:
 
 
 def load_pictures(
-    path: str | Path, downscale: float = 1.0, most: int = 16, longest: int | None = None, test_every: int = 0
+    path: str | Path,
+    downscale: float | None = None,
+    most: int = 16,
+    longest: int | None = None,
+    test_every: int = 0,
 ) -> Scene | None:
     """Some photos of a folder that holds photos alone, spread over it, as a scene that has no poses.
 
@@ -164,7 +178,7 @@ def load_pictures(
     `longest` bounds all photos of the folder as `load_scene` does, and those that `test_every` holds out are
     not among them. `Scene.of` tells how many they were chosen from. ValueError where it holds neither.
     """
-    root, _ = scene_folder(path)
+    (root, _), downscale = scene_folder(path), given(downscale, 1.0)
     if formats_of(root, downscale) or (found := bare_photos(root, downscale)) is None:
         return None
     photos = readable(found)
@@ -193,9 +207,9 @@ def load_pictures(
     return Scene(root.name, views, [], points, colors, "photos", notes, of=of)
 
 
-def check_names(path: str | Path, downscale: float, distance: Distance) -> None:
+def check_names(path: str | Path, downscale: float | None, distance: Distance) -> None:
     """ValueError where photos alone lack one of the two that a distance names: before COLMAP works."""
-    root, _ = scene_folder(path)
+    (root, _), downscale = scene_folder(path), given(downscale, 1.0)
     if not formats_of(root, downscale) and (found := bare_photos(root, downscale)) is not None:
         named_photos(found.names, distance)
 

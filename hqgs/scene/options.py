@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
-from hqgs.base.options import Apart, Factor, Flag, Number, Unsaid, Vector
+from hqgs.base.options import Apart, Factor, Flag, Number, Unsaid, Vector, values
 from hqgs.photos.formula import grammar
-from hqgs.scene.constants import TEST_EVERY
 
 KINDS = f"{grammar()}, some:KIND (only half of the photos), several steps joined by +, mixed, or none"
 
@@ -33,37 +32,19 @@ class PhotoOptions:
     """Up direction in the frame of the photos' cameras (from upright edges, GPS or EXIF)."""
     degrade: Annotated[
         str | None,
-        tyro.conf.arg(
-            metavar="KIND",
-            help=f"Degrade the training photos, for experiments: {KINDS}.",
-            help_behavior_hint="",
-        ),
+        tyro.conf.arg(metavar="KIND", help=f"Degrade the training photos, for experiments: {KINDS}."),
+        Unsaid,
     ] = None
-    restore: Annotated[Path | None, tyro.conf.arg(metavar="WEIGHTS"), Unsaid] = None
+    restore: Annotated[str | Path | None, values("WEIGHTS", "", str), Unsaid] = None
     """Restore the training photos with this network first (a file of weights)."""
-
-    def of_photos(self) -> dict[str, Any]:
-        """Those that were said, as JSON values."""
-        given = {field.name: getattr(self, field.name) for field in fields(PhotoOptions)}
-        if given["restore"] is not None:
-            given["restore"] = str(given["restore"])
-        return {name: value for name, value in given.items() if value is not None and value is not False}
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoadOptions:
-    """What `hqgs.load` is asked for, as config.json keeps it; `hqgs.load` says what each of it is."""
+class LoadOptions(PhotoOptions):
+    """All that `hqgs.load` is asked for, as config.json keeps it: with None where nothing was said."""
 
-    path: str  # absolute, or the name of a built-in scene
-    downscale: float = 1.0
-    test_every: int = TEST_EVERY
-    sfm: bool = False
-    degrade: str = "none"
-    seed: int = 0
-    restore: str | None = None
-    skip_unreadable: bool = True
+    path: str | Path = field(kw_only=False)  # kept: absolute, or the name of a built-in scene
+    seed: int | None = None
+    skip_unreadable: bool | None = None
     longest: int | None = None
     coarse: bool | None = None
-    frames: int | None = None
-    distance: tuple[str | float, ...] | None = None
-    up: tuple[float, ...] | None = None

@@ -6,13 +6,14 @@ The command line and `import hqgs` both call what is here; the former scales lar
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from hqgs.base.options import called_with, given
 from hqgs.base.stages import OnStage, silent
 from hqgs.base.state import own_state
 from hqgs.photos.formula import parse_degradation
@@ -32,41 +33,33 @@ from hqgs.scene.sfm.reconstruct import sfm_scene
 from hqgs.scene.upright import as_asked, direction_of, with_up
 
 
+@dataclass(frozen=True, kw_only=True)
+class LoadCall(LoadOptions):
+    """The arguments of `load`."""
+
+    cache: str | Path | None = None
+    points: bool = True
+    on_stage: OnStage = silent
+
+
+@called_with(LoadCall)
 @own_state(grad=True)
-def load(
-    path: str | Path,
-    *,
-    downscale: float = 1.0,
-    test_every: int = 8,
-    sfm: bool = False,
-    degrade: str = "none",
-    seed: int = 0,
-    restore: str | Path | None = None,
-    skip_unreadable: bool = True,
-    cache: str | Path | None = None,
-    longest: int | None = None,
-    coarse: bool | None = None,
-    frames: int | None = None,
-    distance: Sequence[str | float] | None = None,
-    up: Sequence[float] | None = None,
-    points: bool = True,
-    on_stage: OnStage = silent,
-) -> Scene:
+def load(call: LoadCall) -> Scene:
     """Read a scene into memory: training views, held-out views, pinhole cameras, starting points.
 
     Args:
         path: a folder of photos alone, or a film: COLMAP finds cameras and points. Or a COLMAP, LLFF,
             Deblur-NeRF, nerfstudio, instant-ngp or Blender folder, or "embedded", a room that is built in.
-        downscale: divide the photos' sides by this, at least 1.
-        test_every: hold out each view whose place in the sorted names is a multiple of this; 0: none. A
+        downscale: divide the photos' sides by this, at least 1 (1).
+        test_every: hold out each view whose place in the sorted names is a multiple of this (8); 0: none. A
             folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
         sfm: take cameras and points from the training photos, by COLMAP, in a folder that has its own too.
-        degrade: what happens to the training photos first, as `hqgs.degrade` reads it.
-        seed: of the degradation.
+        degrade: what happens to the training photos first, as `hqgs.degrade` reads it (none).
+        seed: of the degradation (0).
         restore: weights of an image network that the training photos go through at last.
         skip_unreadable: leave out photos that cannot be read, or are of another shape than their camera, as
             long as half of the photos to train on, and of those held out, remain; `Scene.notes` names them.
-            False: an error.
+            False: an error (True).
         cache: a folder that keeps what takes long, for the next call: COLMAP's models, the frames of a film.
         longest: px; scale the photos down further where a side is longer, or where all photos together
             would take more than 4 GB of memory.
@@ -88,25 +81,11 @@ def load(
         FileNotFoundError: a folder, photo or file of weights that is not there.
         ValueError: anything else that is wrong; the message names the file or the photo.
     """
-    named = is_room(path)
-    options = LoadOptions(
-        path=str(path) if named else str(Path(path).expanduser().resolve()),
-        downscale=downscale,
-        test_every=test_every,
-        sfm=sfm,
-        degrade=degrade,
-        seed=seed,
-        restore=None if restore is None else str(restore),
-        skip_unreadable=skip_unreadable,
-        longest=longest,
-        coarse=coarse,
-        frames=frames,
-        distance=None if distance is None else (*distance,),
-        up=None if up is None else (*up,),
-    )
-    scene = load_as(options, cache, points, on_stage)
-    if str(path) == EMBEDDED and not named:
-        note = f"{options.path}: the folder is used, not the built-in scene of that name"
+    named = is_room(call.path)
+    path = str(call.path) if named else str(Path(call.path).expanduser().resolve())
+    scene = load_as(replace(call, path=path), call.cache, call.points, call.on_stage)
+    if str(call.path) == EMBEDDED and not named:
+        note = f"{path}: the folder is used, not the built-in scene of that name"
         scene = replace(scene, notes=[note, *scene.notes])
     return scene
 
@@ -118,7 +97,7 @@ def load_as(
     named = not Path(asked.path).is_absolute()
     apart = None if asked.distance is None else distance_of(asked.distance)
     up = None if asked.up is None else direction_of(asked.up)
-    degradation = parse_degradation(asked.degrade)
+    degradation = parse_degradation(given(asked.degrade, "none"))
     if asked.restore is not None:
         check_weights(asked.restore)
     if asked.frames is not None:
@@ -127,7 +106,7 @@ def load_as(
     models = None if kept is None else kept / KEPT
     scene = _room(asked) if named else _read(asked, kept, models, apart, on_stage)
     if degradation.steps:
-        scene = degrade_scene(scene, degradation, asked.seed)
+        scene = degrade_scene(scene, degradation, given(asked.seed, 0))
     if asked.sfm and (scene.source != "photos" or degradation.steps):
         scene = sfm_scene(scene, models, on_stage)
     scene = scene if asked.restore is None else restore_scene(scene, asked.restore)
@@ -136,7 +115,8 @@ def load_as(
         scene = scene if named or up is not None else with_up(scene)
     scene = scene if apart is None else in_metres(scene, apart)
     scene = scene if up is None else as_asked(scene, up)
-    kept_as = asdict(asked) | {"restore": asked.restore and str(Path(asked.restore).resolve())}
+    kept_as = {option.name: getattr(asked, option.name) for option in fields(LoadOptions)}
+    kept_as |= {} if asked.restore is None else {"restore": str(Path(asked.restore).resolve())}
     return replace(scene, origin=json.loads(json.dumps(kept_as)))
 
 
@@ -144,13 +124,12 @@ def _room(asked: LoadOptions) -> Scene:
     """The built-in scene."""
     if asked.path != EMBEDDED:
         raise ValueError(f"there is no built-in scene {asked.path!r}")
-    if not asked.downscale >= 1:
-        raise ValueError(f"downscale must be at least 1, got {asked.downscale}")
-    if asked.test_every != TEST_EVERY:
-        raise ValueError(
-            f"test_every is {asked.test_every}, but the built-in scene holds out every {TEST_EVERY}th"
-        )
-    width, height = (round(side / asked.downscale) for side in PATH_SIZE)
+    downscale, every = given(asked.downscale, 1.0), given(asked.test_every, TEST_EVERY)
+    if not downscale >= 1:
+        raise ValueError(f"downscale must be at least 1, got {downscale}")
+    if every != TEST_EVERY:
+        raise ValueError(f"test_every is {every}, but the built-in scene holds out every {TEST_EVERY}th")
+    width, height = (round(side / downscale) for side in PATH_SIZE)
     return embedded_scene(width, height)
 
 
@@ -167,17 +146,9 @@ def _read(
             notes.append(note)
         if apart is not None:
             check_names(path, asked.downscale, apart)
-        scene = load_scene(
-            path,
-            asked.downscale,
-            test_every=asked.test_every,
-            skip_unreadable=asked.skip_unreadable,
-            keep_sfm=models,
-            longest=asked.longest,
-            on_stage=on_stage,
-            sfm=asked.sfm,
-            coarse=asked.coarse,
-        )
+        options = {option.name: getattr(asked, option.name) for option in fields(LoadOptions)}
+        options |= {"path": path, "skip_unreadable": given(asked.skip_unreadable, True)}
+        scene = load_scene(**options, keep_sfm=models, on_stage=on_stage)
     return replace(scene, name=name or scene.name, notes=[*notes, *scene.notes])
 
 
@@ -191,7 +162,11 @@ def finding(origin: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
 
 
 def pictures(
-    path: str | Path, *, downscale: float = 1.0, longest: int | None = None, test_every: int | None = None
+    path: str | Path,
+    *,
+    downscale: float | None = None,
+    longest: int | None = None,
+    test_every: int | None = None,
 ) -> Scene:
     """What `hqgs.diagnose` needs of a folder: as `load`, but photos alone, or a film, are given no poses.
 
@@ -201,12 +176,10 @@ def pictures(
         with TemporaryDirectory(prefix="hqgs-film-") as name:
             film = film_at(path)
             source = path if film is None else film_frames(film, Path(name))[0]
-            if (
-                scene := load_pictures(source, downscale, longest=longest, test_every=test_every or 0)
-            ) is not None:
+            scene = load_pictures(source, downscale, longest=longest, test_every=test_every or 0)
+            if scene is not None:
                 return scene if film is None else replace(scene, name=film.stem)
-    every = TEST_EVERY if test_every is None else test_every
-    return load(path, downscale=downscale, longest=longest, test_every=every, points=False)
+    return load(path, downscale=downscale, longest=longest, test_every=test_every, points=False)
 
 
 @own_state(grad=True)
