@@ -126,7 +126,9 @@ class Parts:
         """The scene with cameras that are found without the part."""
         keep = self.study.args.out / "scenes" / f"{cell.scene.name} without {cell.row.label}"
         longest = self.study.protocol.longest
-        return load_scene(self.folders[cell.scene.name], cell.downscale, keep_sfm=keep, longest=longest)
+        return load_scene(
+            self.folders[cell.scene.name], downscale=cell.downscale, keep_sfm=keep, longest=longest
+        )
 
 
 def print_of(trainer: Trainer) -> str:

@@ -75,7 +75,7 @@ def test_undistorted_at_twice_the_wanted_size(tmp_path: Path, suffix: str) -> No
     write_colmap(truth, tmp_path)
     camera = pycolmap.Camera(model=BENT[0], params=BENT[1], width=WIDTH, height=HEIGHT)
     flat = to_pinhole(camera, WIDTH, HEIGHT)
-    scene = load_scene(tmp_path, 4.2, test_every=0)
+    scene = load_scene(tmp_path, downscale=4.2, test_every=0)
     for view in scene.train:
         full = flat.picture(decode(tmp_path / "images" / view.name)[0])
         wanted, _ = area_downscale(full, None, view.camera.width, view.camera.height)
@@ -95,7 +95,7 @@ def test_the_mask_of_an_undistorted_photo_is_kept(tmp_path: Path) -> None:
     Image.fromarray(mask).save(tmp_path / "masks/view_00.png")
     camera = pycolmap.Camera(model=BENT[0], params=BENT[1], width=WIDTH, height=HEIGHT)
     flat = to_pinhole(camera, WIDTH, HEIGHT)
-    (view,) = load_scene(tmp_path, 4.2, test_every=0).train
+    (view,) = load_scene(tmp_path, downscale=4.2, test_every=0).train
     assert view.mask is not None
     full = flat.mask(mask > 0)
     wanted = area_downscale(
@@ -189,7 +189,7 @@ from pathlib import Path
 from hqgs.scene.load import load_scene
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
-load_scene(sys.argv[1], 4.0)
+load_scene(sys.argv[1], downscale=4.0)
 before = resident()
 scene = load_scene(sys.argv[1], 1.1)
 print(resident() - before, sum(view.image.nbytes for view in [*scene.train, *scene.test]))

@@ -242,13 +242,13 @@ def test_photos_that_lie_on_their_side_beside_upright_cameras(
 ) -> None:
     """Most programs read photos as their EXIF data show them."""
     write_colmap(TRUTH, tmp_path)
-    own = load_scene(tmp_path, downscale, test_every=0)
+    own = load_scene(tmp_path, downscale=downscale, test_every=0)
     for name in TRUTH.names:
         tags = Image.Exif()
         tags[274] = orientation
         with Image.open(tmp_path / "images" / name) as photo:
             photo.transpose(turned).save(tmp_path / "images" / name, exif=tags)
-    scene = load_scene(tmp_path, downscale, test_every=0)
+    scene = load_scene(tmp_path, downscale=downscale, test_every=0)
     for view, wanted in zip(scene.train, own.train, strict=True):
         np.testing.assert_array_equal(view.image, wanted.image)
         assert view.quarter_turns == 0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from hqgs.base.options import Factor, Number
-from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.errors import fail
 from hqgs.cli.judge import check_source
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import check_above, measured_scene, tell_read
@@ -43,51 +43,44 @@ OPTIONS = Clean
 
 def run(options: Clean) -> int:
     """Clean and say what it gained; return the exit code (0 done, 1 no gain or failed, 2 bad input)."""
-    try:
-        from hqgs.model.formats.files import format_of  # here: --help waits for no array
+    from hqgs.model.formats.files import format_of  # here: --help waits for no array
 
-        format = format_of(options.out, written=True)
-        check_above(options.out)
-        source = check_source(options.source, options.photos)
-        if options.out.exists() and options.out.samefile(source):
-            raise ValueError(
-                f"--out is the source {source} itself: name another file, or what is removed would be lost"
-            )
-        from hqgs.evaluation.run_folder import RunFolder  # here: they load torch
-        from hqgs.model.gaussians import Gaussians
-        from hqgs.training.cleaning import CLEANING_STEPS, check_steps, clean, held_out_psnrs
+    format = format_of(options.out, written=True)
+    check_above(options.out)
+    source = check_source(options.source, options.photos)
+    if options.out.exists() and options.out.samefile(source):
+        raise ValueError(
+            f"--out is the source {source} itself: name another file, or what is removed would be lost"
+        )
+    from hqgs.evaluation.run_folder import RunFolder  # here: they load torch
+    from hqgs.model.gaussians import Gaussians
+    from hqgs.training.cleaning import CLEANING_STEPS, check_steps, clean, held_out_psnrs
 
-        steps = CLEANING_STEPS if options.steps is None else options.steps
-        check_steps(steps)
-        run = RunFolder.open(options.source)
-        background = run.background
-        with LoadingScreen() as screen:
-            scene = measured_scene(
-                run, options.source, options.photos, options.downscale, options.test_every, screen
-            )
-            gaussians = Gaussians.load(source)
-            done = clean(gaussians.in_world(scene.world), scene, steps, background, screen.stage)
-        cleaned = done.gaussians.in_world(gaussians.world)  # in the frame of the source
-        with TemporaryDirectory() as folder:  # what counts is the file: its format may hold less
-            cleaned.save(Path(folder, options.out.name))
-            back = Gaussians.load(Path(folder, options.out.name))
-        written = replace(done, after=held_out_psnrs(back.in_world(scene.world), scene, background))
-        words = gained(written)
-        if not written.pays:
-            lossy = f" as a .{format} file, which is less exact" if done.pays else ""
-            held = (
-                ""
-                if options.photos is None
-                else " (photos that the scene was trained on cannot show an improvement)"
-            )
-            return fail(
-                1, f"{source}: held-out photos do not improve{lossy}; nothing was written: {words}{held}"
-            )
-        cleaned.save(options.out)
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{options.out}: {error}")
+    steps = CLEANING_STEPS if options.steps is None else options.steps
+    check_steps(steps)
+    run = RunFolder.open(options.source)
+    background = run.background
+    with LoadingScreen() as screen:
+        scene = measured_scene(
+            run, options.source, options.photos, options.downscale, options.test_every, screen
+        )
+        gaussians = Gaussians.load(source)
+        done = clean(gaussians.in_world(scene.world), scene, steps, background, screen.stage)
+    cleaned = done.gaussians.in_world(gaussians.world)  # in the frame of the source
+    with TemporaryDirectory() as folder:  # what counts is the file: its format may hold less
+        cleaned.save(Path(folder, options.out.name))
+        back = Gaussians.load(Path(folder, options.out.name))
+    written = replace(done, after=held_out_psnrs(back.in_world(scene.world), scene, background))
+    words = gained(written)
+    if not written.pays:
+        lossy = f" as a .{format} file, which is less exact" if done.pays else ""
+        held = (
+            ""
+            if options.photos is None
+            else " (photos that the scene was trained on cannot show an improvement)"
+        )
+        return fail(1, f"{source}: held-out photos do not improve{lossy}; nothing was written: {words}{held}")
+    cleaned.save(options.out)
     tell_read(gaussians)
     for what in left_out(gaussians, cleaned, back, format):
         print(f"left out: {what}")

@@ -9,7 +9,6 @@ import tyro
 
 from hqgs.base.files import check_new_folder
 from hqgs.base.options import Folder
-from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Photos, load, ready
 from hqgs.photos.formula import parse_degradation
@@ -32,19 +31,14 @@ OPTIONS = Degrade
 
 def run(options: Degrade) -> int:
     """Write the scene; return the exit code (0 done, 1 failed, 2 bad input)."""
-    try:
-        degradation = parse_degradation(options.kind)
-        check_new_folder(options.out)
-        ready(options.scene)
-        with LoadingScreen() as screen:
-            scene = load(options, screen)
-        from hqgs.scene.degrade import write_degraded_scene  # here: it loads torch
+    degradation = parse_degradation(options.kind)
+    check_new_folder(options.out)
+    ready(options.scene)
+    with LoadingScreen() as screen:
+        scene = load(options, screen)
+    from hqgs.scene.degrade import write_degraded_scene  # here: it loads torch
 
-        write_degraded_scene(scene, options.out, degradation, options.seed)
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{options.out}: {error}")
+    write_degraded_scene(scene, options.out, degradation, options.seed)
     photos = f"{len(scene.train)} training photos with {degradation}, {len(scene.test)} held out"
     print(f"{options.out}: {photos}")
     return 0

@@ -10,7 +10,6 @@ import tyro
 
 import hqgs
 from hqgs.base.files import write_json
-from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.scenes import Photos, check_out_file, ready
 from hqgs.training.config import longest_side
 
@@ -28,24 +27,19 @@ OPTIONS = Diagnose
 
 def run(options: Diagnose) -> int:
     """Print the diagnosis; return the exit code (0 done, 1 failed, 2 bad input)."""
-    try:
-        if options.out is not None:
-            check_out_file(options.out)
-        ready(options.scene)
-        from hqgs.scene.source import pictures  # here: it loads torch
+    if options.out is not None:
+        check_out_file(options.out)
+    ready(options.scene)
+    from hqgs.scene.source import pictures  # here: it loads torch
 
-        scene = pictures(
-            options.scene,
-            downscale=1.0 if options.downscale is None else options.downscale,
-            longest=longest_side("standard", options.downscale),  # as a run sees them
-        )
-        diagnosis = hqgs.diagnose(scene)
-        if options.out is not None:
-            write_json(options.out, asdict(diagnosis))
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{options.out}: {error}")
+    scene = pictures(
+        options.scene,
+        downscale=options.downscale,
+        longest=longest_side("standard", options.downscale),  # as a run sees them
+    )
+    diagnosis = hqgs.diagnose(scene)
+    if options.out is not None:
+        write_json(options.out, asdict(diagnosis))
     print(diagnosis)
     for note in scene.notes:
         print(f"  {note}")

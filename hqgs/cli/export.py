@@ -10,7 +10,6 @@ import tyro
 
 from hqgs.base.options import Factor, Flag, values
 from hqgs.base.text import markdown_table
-from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Photos, check_above, load, measured_scene, ready, tell_read
 from hqgs.model.formats.files import FORMATS, WRITTEN, format_of, scene_file
@@ -61,54 +60,49 @@ OPTIONS = ExportScene
 
 def run(args: ExportScene) -> int:
     """Export what `args` say and print tables; return the exit code (0 done, 1 failed, 2 bad input)."""
-    try:
-        options = ExportOptions(
-            format=format_of(args.out, args.format, written=True),
-            sh_degree=args.sh_degree,
-            band_tolerance=args.band_tolerance,
-            sh_bits=args.sh_bits,
-            spz_version=args.spz_version,
+    options = ExportOptions(
+        format=format_of(args.out, args.format, written=True),
+        sh_degree=args.sh_degree,
+        band_tolerance=args.band_tolerance,
+        sh_bits=args.sh_bits,
+        spz_version=args.spz_version,
+    )
+    _check_together(args, options.format)
+    source = scene_file(args.source)
+    check_above(args.out)
+    if args.out.exists() and args.out.samefile(source):
+        raise ValueError(
+            f"--out is the source {source} itself: name another file, or what is left out would be lost"
         )
-        _check_together(args, options.format)
-        source = scene_file(args.source)
-        check_above(args.out)
-        if args.out.exists() and args.out.samefile(source):
-            raise ValueError(
-                f"--out is the source {source} itself: name another file, or what is left out would be lost"
-            )
-        if args.trust and not FORMATS[options.format].errors:
-            places = " and ".join(f".{name}" for name, format in FORMATS.items() if format.errors)
-            raise ValueError(f"--trust: a .{options.format} file cannot store it; {places} files can")
-        from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
-        from hqgs.evaluation.run_folder import RunFolder
-        from hqgs.model.gaussians import Gaussians
-        from hqgs.show.export import export, measure
+    if args.trust and not FORMATS[options.format].errors:
+        places = " and ".join(f".{name}" for name, format in FORMATS.items() if format.errors)
+        raise ValueError(f"--trust: a .{options.format} file cannot store it; {places} files can")
+    from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
+    from hqgs.evaluation.run_folder import RunFolder
+    from hqgs.model.gaussians import Gaussians
+    from hqgs.show.export import export, measure
 
-        gaussians, run = Gaussians.load(source), RunFolder.open(args.source)
-        scene = None if args.scene is None else _held_out_photos(run, args)
-        if args.trust:
-            from hqgs.show.trust import trust_of
+    gaussians, run = Gaussians.load(source), RunFolder.open(args.source)
+    scene = None if args.scene is None else _held_out_photos(run, args)
+    if args.trust:
+        from hqgs.show.trust import trust_of
 
-            gaussians.errors = trust_of(gaussians, gaussians.along(run.cameras)).errors.clamp(max=1)
+        gaussians.errors = trust_of(gaussians, gaussians.along(run.cameras)).errors.clamp(max=1)
 
-        def held_out(shown: Gaussians) -> float | None:
-            if scene is None:
-                return None
-            renders = held_out_renders(scene, shown, background=run.background)
-            return held_out_psnr(scene, renders)
+    def held_out(shown: Gaussians) -> float | None:
+        if scene is None:
+            return None
+        renders = held_out_renders(scene, shown, background=run.background)
+        return held_out_psnr(scene, renders)
 
-        before = held_out(gaussians)
-        written = export(gaussians, args.out, options)
-        back = Gaussians.load(args.out, options.format)
-        after = held_out(back)
-        try:
-            changed = f"measured: {measure(gaussians, back, run.cameras)}"
-        except ValueError as error:
-            changed = f"not measured: {error}"
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{args.out}: {error}")
+    before = held_out(gaussians)
+    written = export(gaussians, args.out, options)
+    back = Gaussians.load(args.out, options.format)
+    after = held_out(back)
+    try:
+        changed = f"measured: {measure(gaussians, back, run.cameras)}"
+    except ValueError as error:
+        changed = f"not measured: {error}"
     print(_table(source, gaussians, before, written, after), end="\n\n")
     tell_read(gaussians)
     print(changed)

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import tyro
 
 from hqgs.base.files import CONFIG, PLY, REPORT
-from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import duration
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.evaluation.verdict import judged_by, verdict
@@ -33,21 +32,16 @@ def run(options: Info) -> int:
     from hqgs.model.formats.files import has_format, scene_file  # here: --help waits for no array
 
     path = options.path
-    try:
-        if path.is_file() and has_format(path):
-            lines = _file(path)
-        elif (found := _run(path)) is not None:
-            lines = found
-        elif (path / "meta.json").is_file() or (is_run(path) and (path / PLY).is_file()):
-            lines = _file(scene_file(path))
-        elif is_run(path):
-            lines = [_not_ended(path)]
-        else:
-            lines = _photos(path)
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{path}: {error}")
+    if path.is_file() and has_format(path):
+        lines = _file(path)
+    elif (found := _run(path)) is not None:
+        lines = found
+    elif (path / "meta.json").is_file() or (is_run(path) and (path / PLY).is_file()):
+        lines = _file(scene_file(path))
+    elif is_run(path):
+        lines = [_not_ended(path)]
+    else:
+        lines = _photos(path)
     print("\n".join(lines))
     return 0
 

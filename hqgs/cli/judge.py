@@ -12,7 +12,6 @@ import tyro
 from hqgs import __version__
 from hqgs.base.files import CONFIG, write_json
 from hqgs.base.options import Color, Factor, Number
-from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import check_background, check_out_folder, measured_scene, ready
 from hqgs.evaluation.judge_words import told
@@ -55,56 +54,51 @@ OPTIONS = Judge
 
 def run(options: Judge) -> int:
     """Measure and say how good it is; return the exit code (0 done, 1 failed, 2 bad input)."""
-    try:
-        if options.background is not None:
-            check_background(options.background)
-        if options.out is not None:
-            check_out_folder(options.out)
-        source, other, known = check_source(options.source, options.photos), None, None
-        from hqgs.evaluation.judge import compared  # here: they load torch
-        from hqgs.evaluation.protocol import check_comparable, chosen_views, protocol_of, read_judgement
-        from hqgs.evaluation.run_folder import RunFolder
-        from hqgs.model.formats.files import scene_file
+    if options.background is not None:
+        check_background(options.background)
+    if options.out is not None:
+        check_out_folder(options.out)
+    source, other, known = check_source(options.source, options.photos), None, None
+    from hqgs.evaluation.judge import compared  # here: they load torch
+    from hqgs.evaluation.protocol import check_comparable, chosen_views, protocol_of, read_judgement
+    from hqgs.evaluation.run_folder import RunFolder
+    from hqgs.model.formats.files import scene_file
 
-        run = RunFolder.open(options.source)
+    run = RunFolder.open(options.source)
 
-        if (
-            options.against is not None
-            and options.against.suffix.lower() == ".json"
-            and options.against.is_file()
-        ):
-            known = read_judgement(options.against)
-        elif options.against is not None:
-            other = scene_file(options.against)
-        with LoadingScreen() as screen:
-            scene = measured_scene(
-                run, options.source, options.photos, options.downscale, options.test_every, screen
-            )
-            views = chosen_views(scene, options.views)
-            background = run.background if options.background is None else options.background
-            protocol = protocol_of(scene, options.views, views, background)
-            if known is not None:
-                check_comparable(protocol, known["protocol"], str(options.against))
-            judged = [
-                judge_file(file, scene, views, background, screen, fit=options.fit_cameras)
-                for file in [source, other]
-                if file is not None
-            ]
-        found: dict[str, Any] = {"hqgs": __version__, "protocol": protocol, "scene": judged[0].json()}
-        if known is not None or other is not None:
-            found["against"] = known["scene"] if known is not None else judged[1].json()
-            found["difference"] = compared(found["scene"], found["against"])
-        psnr, name = judged_by({**(run.report or {}), "metrics": {"mean": found["scene"]["mean"]}})
-        found["judged_by"] = {"psnr": psnr, "name": name}
-        if options.out is not None:
-            from hqgs.show.page.judge_page import write_judge_page
+    if (
+        options.against is not None
+        and options.against.suffix.lower() == ".json"
+        and options.against.is_file()
+    ):
+        known = read_judgement(options.against)
+    elif options.against is not None:
+        other = scene_file(options.against)
+    with LoadingScreen() as screen:
+        scene = measured_scene(
+            run, options.source, options.photos, options.downscale, options.test_every, screen
+        )
+        views = chosen_views(scene, options.views)
+        background = run.background if options.background is None else options.background
+        protocol = protocol_of(scene, options.views, views, background)
+        if known is not None:
+            check_comparable(protocol, known["protocol"], str(options.against))
+        judged = [
+            judge_file(file, scene, views, background, screen, fit=options.fit_cameras)
+            for file in [source, other]
+            if file is not None
+        ]
+    found: dict[str, Any] = {"hqgs": __version__, "protocol": protocol, "scene": judged[0].json()}
+    if known is not None or other is not None:
+        found["against"] = known["scene"] if known is not None else judged[1].json()
+        found["difference"] = compared(found["scene"], found["against"])
+    psnr, name = judged_by({**(run.report or {}), "metrics": {"mean": found["scene"]["mean"]}})
+    found["judged_by"] = {"psnr": psnr, "name": name}
+    if options.out is not None:
+        from hqgs.show.page.judge_page import write_judge_page
 
-            write_json(options.out / NUMBERS, found)
-            write_judge_page(options.out / PAGE, found, judged)
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{options.out or options.source}: {error}")
+        write_json(options.out / NUMBERS, found)
+        write_judge_page(options.out / PAGE, found, judged)
     print(told(found))
     if options.out is not None:
         print(f"\n{options.out / PAGE}: photos beside renders, and where the errors are")

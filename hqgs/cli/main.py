@@ -17,7 +17,7 @@ from io import TextIOWrapper
 from typing import NamedTuple, TextIO
 
 from hqgs import __version__
-from hqgs.cli.errors import fail
+from hqgs.cli.errors import BAD_INPUT, fail
 
 
 class Command(NamedTuple):
@@ -91,15 +91,22 @@ def command(argv: Sequence[str] | None) -> int:
         mean = f"did you mean {near[0]!r}? " if near else ""
         what = "option" if name.startswith("-") else "command"
         return fail(2, f"there is no {what} {name!r}; {mean}The commands are: {', '.join(COMMANDS)}")
+    options: object = None
     try:
         from hqgs.cli.parse import parse  # here: only a command waits for the parser
 
         module = import_module(COMMANDS[name].module)
-        read = getattr(module, "read", parse)
-        return module.run(read(module.OPTIONS, name, COMMANDS[name].about, rest))
+        options = getattr(module, "read", parse)(module.OPTIONS, name, COMMANDS[name].about, rest)
+        return module.run(options)
     except KeyboardInterrupt:
-        print("hqgs: stopped", file=sys.stderr)
-        return 130
+        return fail(130, "stopped")
+    except BrokenPipeError:  # `main` knows it
+        raise
+    except BAD_INPUT as error:
+        return fail(2, error)
+    except OSError as error:
+        places = [getattr(options, place, None) for place in ("out", "source", "path", "scene")]
+        return fail(1, f"{next(filter(None, places), name)}: {error}")
 
 
 def overview() -> str:

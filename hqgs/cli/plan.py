@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from hqgs.base.options import Number, Unsaid
-from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.base.options import Number, Unsaid, given
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Photos, ready
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.names import KEPT
 from hqgs.scene.photo_files import is_run
-from hqgs.training.config import PresetOption, TrainOptions, decided, longest_side
+from hqgs.training.config import STANDARD, PresetOption, TrainOptions, decided, longest_side
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,40 +33,33 @@ OPTIONS = PlanOptions
 
 def run(options: PlanOptions) -> int:
     """Print the plan; return the exit code (0 done, 2 bad input)."""
-    try:
-        config = decided(options.said() | ({} if options.preset is None else {"preset": options.preset}))
-        posed = options.out is not None and (options.out / KEPT).exists()
-        if options.out is not None and not posed and not is_run(options.out):
-            raise ValueError(f"--out {options.out}: there is no run; leave --out away to plan a new run")
-        ready(options.scene)
-        from hqgs.scene.source import finding, load, pictures  # here: they load torch
-        from hqgs.training.frame import Frame
-        from hqgs.training.prepare import Prepared, plan_of_photos
-        from hqgs.training.trainer import Trainer
+    config = decided({"preset": given(options.preset, STANDARD)} | options.said())
+    posed = options.out is not None and (options.out / KEPT).exists()
+    if options.out is not None and not posed and not is_run(options.out):
+        raise ValueError(f"--out {options.out}: there is no run; leave --out away to plan a new run")
+    ready(options.scene)
+    from hqgs.scene.source import finding, load, pictures  # here: they load torch
+    from hqgs.training.frame import Frame
+    from hqgs.training.prepare import Prepared, plan_of_photos
+    from hqgs.training.trainer import Trainer
 
-        downscale = 1.0 if options.downscale is None else options.downscale
-        test_every = TEST_EVERY if options.test_every is None else options.test_every
-        longest = longest_side(options.preset, options.downscale)
-        with LoadingScreen() as screen:
-            if posed and options.out is not None:
-                scene = load(
-                    options.scene,
-                    downscale=downscale,
-                    longest=longest,
-                    test_every=test_every,
-                    cache=options.out,
-                    on_stage=screen.stage,
-                    **finding(RunFolder(options.out).loaded, options.scene),
-                )
-            else:
-                scene = pictures(options.scene, downscale=downscale, longest=longest, test_every=TEST_EVERY)
-            later: list[str] = []
-            if len(scene.points):
-                plan = Prepared(Frame.of(scene), config, begin=Trainer).plan()
-            else:
-                plan, later = plan_of_photos(scene, config)
-    except BAD_INPUT as error:
-        return fail(2, error)
+    told = RunFolder(options.out).loaded if posed and options.out is not None else {}
+    asked: dict[str, Any] = {
+        "downscale": options.downscale,
+        "longest": longest_side(options.preset, options.downscale),
+        "test_every": given(options.test_every, given(told.get("test_every"), TEST_EVERY)),
+    }
+    with LoadingScreen() as screen:
+        if posed:
+            asked |= {"cache": options.out, "on_stage": screen.stage}
+            scene = load(options.scene, **asked, **finding(told, options.scene))
+        else:
+            scene = pictures(options.scene, **asked)
+        later: list[str] = []
+        if len(scene.points):
+            plan = Prepared(Frame.of(scene), config, begin=Trainer).plan()
+        else:
+            plan, later = plan_of_photos(scene, config)
     photos = f"{scene.of or len(scene.train)} photos to train on"
     looked = f" ({len(scene.train)} of them measured)" if scene.of not in (None, len(scene.train)) else ""
     print(f"{scene.name}: {photos}{looked}, {len(scene.points):,} points")

@@ -13,7 +13,6 @@ import tyro
 
 from hqgs.base.options import Color, Factor, Number, Size, Unsaid, Vector, choice
 from hqgs.base.text import some
-from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.scenes import check_above, check_background, tell_read
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
@@ -64,44 +63,39 @@ OPTIONS = Render
 def run(options: Render) -> int:
     """Render, and say what was written; return the exit code (0 done, 1 failed, 2 bad input)."""
     source, out, size = options.source, options.out, options.size
-    try:
-        from hqgs.model.formats.files import scene_file  # here: --help waits for no array
+    from hqgs.model.formats.files import scene_file  # here: --help waits for no array
 
-        file, run = scene_file(source), RunFolder.open(source)
-        _check(options, run)
-        from hqgs.evaluation.looks import look_of
-        from hqgs.model.gaussians import Gaussians
-        from hqgs.scene.paths import with_size
-        from hqgs.show.frames import check_frames, render_frames, written_size  # here: they load torch
+    file, run = scene_file(source), RunFolder.open(source)
+    _check(options, run)
+    from hqgs.evaluation.looks import look_of
+    from hqgs.model.gaussians import Gaussians
+    from hqgs.scene.paths import with_size
+    from hqgs.show.frames import check_frames, render_frames, written_size  # here: they load torch
 
-        gaussians = Gaussians.load(file)
-        tell_read(gaussians)
-        names, cameras, rate = _cameras(options, gaussians, run)
-        if size is not None:
-            cameras = [with_size(camera, *size) for camera in cameras]
-        if out.suffix.lower() == ".png" and options.views is None:
-            cameras = cameras[:1]
-        fps = rate if options.fps is None else options.fps
-        check_frames(cameras, out, fps, options.show)
-        look = None if options.look is None else look_of(run.folder, options.look)
-        trust = _trust(options, gaussians, run) if options.show == "trust" else None  # it may take minutes
-        started = time.perf_counter()
-        render_frames(
-            gaussians,
-            cameras,
-            out,
-            fps=fps,
-            show=options.show,
-            background=run.background if options.background is None else options.background,
-            names=names,
-            progress=_progress if sys.stderr.isatty() else None,
-            trust=trust,
-            look=look,
-        )
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{out}: {error}")
+    gaussians = Gaussians.load(file)
+    tell_read(gaussians)
+    names, cameras, rate = _cameras(options, gaussians, run)
+    if size is not None:
+        cameras = [with_size(camera, *size) for camera in cameras]
+    if out.suffix.lower() == ".png" and options.views is None:
+        cameras = cameras[:1]
+    fps = rate if options.fps is None else options.fps
+    check_frames(cameras, out, fps, options.show)
+    look = None if options.look is None else look_of(run.folder, options.look)
+    trust = _trust(options, gaussians, run) if options.show == "trust" else None  # it may take minutes
+    started = time.perf_counter()
+    render_frames(
+        gaussians,
+        cameras,
+        out,
+        fps=fps,
+        show=options.show,
+        background=run.background if options.background is None else options.background,
+        names=names,
+        progress=_progress if sys.stderr.isatty() else None,
+        trust=trust,
+        look=look,
+    )
     seconds = time.perf_counter() - started
     kinds = sorted({written_size(out, camera.width, camera.height) for camera in cameras})
     px = f"{kinds[0][0]} x {kinds[0][1]} px" if len(kinds) == 1 else "several sizes"

@@ -17,10 +17,9 @@ import tyro
 
 from hqgs.base.files import CHECKPOINT
 from hqgs.base.interrupt import ENDINGS
-from hqgs.base.options import Factor
+from hqgs.base.options import Factor, given
 from hqgs.base.text import some
 from hqgs.cli.errors import fail
-from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.names import existing_folder, is_room
 from hqgs.scene.photo_files import film_at, strangers
 from hqgs.training.config import longest_side
@@ -131,9 +130,9 @@ def measured_scene(
         )
     scene = load(
         photos,
-        downscale=1.0 if downscale is None else downscale,
+        downscale=downscale,
         longest=longest_side("standard", downscale),
-        test_every=run.loaded.get("test_every", TEST_EVERY) if test_every is None else test_every,
+        test_every=given(test_every, run.loaded.get("test_every")),
         skip_unreadable=False,
         points=False,
         cache=run.folder if run.config else None,
@@ -154,9 +153,8 @@ def load(photos: Photos, screen: LoadingScreen) -> Scene:
     """The scene of a command that takes no more than the photos."""
     from hqgs.scene.source import load as load_source  # here: it loads torch
 
-    downscale = 1.0 if photos.downscale is None else photos.downscale
-    stage = screen.stage
-    return load_source(photos.scene, downscale=downscale, skip_unreadable=False, points=False, on_stage=stage)
+    asked, stage = photos.downscale, screen.stage
+    return load_source(photos.scene, downscale=asked, skip_unreadable=False, points=False, on_stage=stage)
 
 
 def check_out(out: Path, scene: str, resume: bool, overwrite: bool) -> list[str]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from hqgs.base.files import check_new_folder
 from hqgs.base.options import Folder, Number
-from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.errors import fail
 from hqgs.cli.progress import LoadingScreen, duration
 from hqgs.cli.scenes import SceneName, ready
 
@@ -41,10 +41,6 @@ def run(options: Sfm) -> int:
             )
     except KeyboardInterrupt:
         return fail(130, "stopped; the same command continues with what COLMAP has found")
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{options.out}: {error}")
     print(report)
     print(f"{options.out}: images and sparse/0, by COLMAP in {duration(screen.colmap_seconds)}")
     print(f"next: hqgs train {options.out} --out RUN")

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +19,7 @@ from hqgs.base.files import CHECKPOINT, PAGE, PLY, lock_folder
 from hqgs.base.left_out import format_left_out
 from hqgs.base.options import Flag, Folder, Number, Unsaid
 from hqgs.base.ranks import RankError, Ranks, joined, was_restarted
-from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.errors import fail
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, Times, TrainingScreen, duration
 from hqgs.cli.scenes import Photos, check_out, ready, tell_notes
@@ -124,10 +124,6 @@ def run(options: Train) -> int:
             return fail(130, "stopped at once; --resume continues from the last checkpoint")
         found = " The same command continues with what COLMAP has found" if (out / KEPT).exists() else ""
         return fail(130, f"stopped before the first checkpoint.{found}")
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{out}: {error}")
     except (hqgs.TrainingError, RankError) as error:
         return fail(1, str(error))
     code = 0 if done.finished else 130
@@ -237,12 +233,13 @@ def loading(options: Train, config: TrainConfig) -> dict[str, Any]:
     run = RunFolder(options.out)
     before = dict(run.loaded) if options.resume and (options.out / CHECKPOINT).exists() else {}
     if options.downscale is not None or options.preset is not None or not before:
-        before["longest"] = longest_side(options.preset, options.downscale)
-        before.pop("downscale", None)
-    unreadable = "photos" in config.leave_out
+        before |= {"longest": longest_side(options.preset, options.downscale), "downscale": None}
     path = str(options.scene if is_room(options.scene) else Path(options.scene).expanduser().resolve())
-    said = options.of_photos() | {"path": path, "seed": config.seed, "skip_unreadable": unreadable}
-    return before | said
+    said = {option.name: getattr(options, option.name) for option in fields(PhotoOptions)}
+    said = {name: value for name, value in said.items() if value is not None and value is not False}
+    return (
+        before | said | {"path": path, "seed": config.seed, "skip_unreadable": "photos" in config.leave_out}
+    )
 
 
 def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.scenes import heed_endings, tell_read
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.show.viewer.guard import ELSEWHERE, PORT, check
@@ -44,22 +43,19 @@ OPTIONS = ViewOptions
 
 def run(options: ViewOptions, seconds: float | None = None) -> int:
     """Show a scene until Ctrl-C, or for some seconds; return the exit code (0 done, 2 bad input)."""
-    try:
-        from hqgs.model.formats.files import scene_file  # here: --help waits for no array
+    from hqgs.model.formats.files import scene_file  # here: --help waits for no array
 
-        file = scene_file(options.source)
-        check(options.port)
-        from hqgs.evaluation.photo_facts import facts_of_photos  # here: they load torch
-        from hqgs.model.gaussians import Gaussians
-        from hqgs.show.viewer.viewer import Viewer
+    file = scene_file(options.source)
+    check(options.port)
+    from hqgs.evaluation.photo_facts import facts_of_photos  # here: they load torch
+    from hqgs.model.gaussians import Gaussians
+    from hqgs.show.viewer.viewer import Viewer
 
-        heed_endings()
-        gaussians, run = Gaussians.load(file), RunFolder.open(file)
-        report, title = run.report, run.folder.resolve().name
-        cameras, source = gaussians.along(run.cameras), options.source
-        viewer = Viewer(cameras, run.folder, port=options.port, title=title, source=source)
-    except BAD_INPUT as error:
-        return fail(2, error)
+    heed_endings()
+    gaussians, run = Gaussians.load(file), RunFolder.open(file)
+    report, title = run.report, run.folder.resolve().name
+    cameras, source = gaussians.along(run.cameras), options.source
+    viewer = Viewer(cameras, run.folder, port=options.port, title=title, source=source)
     try:
         tell_read(gaussians)
         viewer.set_scene(gaussians, _numbers(report, len(gaussians)))
@@ -67,8 +63,6 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
         viewer.set_facts({} if report is None else facts_of_photos(report))
         _tell(viewer.url, options.open)
         viewer.serve(seconds)
-    except BAD_INPUT as error:
-        return fail(2, error)
     except KeyboardInterrupt:
         print()
     finally:

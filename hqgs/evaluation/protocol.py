@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from hqgs._rust import EPS2D
+from hqgs.base.options import given
 from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.scene.camera_files import picked
+from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.scene import Scene, View
 
 HELD_OUT, TRAINED, ALL = "test", "train", "all"
@@ -52,7 +54,7 @@ def protocol_of(
         "pixels": digest_of(views),
         "masked": sum(view.mask is not None for view in views),
         "background": [*background],
-        "downscale": origin.get("downscale", 1.0),
+        "downscale": given(origin.get("downscale"), 1.0),
         "longest": origin.get("longest"),
         "version": VERSION,
         "rules": RULES,
@@ -61,7 +63,7 @@ def protocol_of(
 
 def told_which(scene: Scene, which: str) -> str:
     """Which photos were measured on, in words."""
-    every = (scene.origin or {}).get("test_every", 0)
+    every = 0 if scene.origin is None else given(scene.origin.get("test_every"), TEST_EVERY)
     rule = f"every {every}th by name, unless the scene has a split" if every else "as the scene has them"
     return {HELD_OUT: f"held out ({rule})", TRAINED: "training photos", ALL: "all, training photos too"}.get(
         which, "as named"

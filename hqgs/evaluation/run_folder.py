@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from hqgs.scene.scene import Camera, Scene
 
 
+LEFT = {"features", "tag_size"}  # options of older versions
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """The folder that a run wrote, or that a scene file lies in: what is there of a run.
@@ -57,7 +60,7 @@ class RunFolder:
     def loaded(self) -> dict[str, Any]:
         """What `hqgs.load` was asked for; empty where nothing tells, as of a scene made in Python."""
         told = self._part("scene")
-        return {name: value for name, value in told.items() if name != "features"}  # of older versions
+        return {name: value for name, value in told.items() if name not in LEFT}
 
     @cached_property
     def cameras(self) -> RunCameras | None:

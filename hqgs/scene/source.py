@@ -170,7 +170,7 @@ def pictures(
 ) -> Scene:
     """What `hqgs.diagnose` needs of a folder: as `load`, but photos alone, or a film, are given no poses.
 
-    Of photos alone some are read, spread over those that `test_every` does not hold out.
+    Of photos alone some are read, spread over those that `test_every` does not hold out (None: over all).
     """
     if not is_room(path):
         with TemporaryDirectory(prefix="hqgs-film-") as name:
