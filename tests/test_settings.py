@@ -125,7 +125,7 @@ def test_a_run_keeps_what_was_said_and_what_was_decided_apart(tmp_path: Path) ->
     assert (run.iterations, run.report["config"]["method"]) == (6, "3dgs")
     assert asdict(decided(read_said(tmp_path)))["densify"]["max_gaussians"] == 900
     assert json.loads((tmp_path / CONFIG).read_text())["said"] == kept["said"] | {"iterations": 6}
-    with pytest.raises(ValueError, match="--resume can make it longer, not shorter"):
+    with pytest.raises(ValueError, match="--resume can make a run longer, not shorter"):
         train(tiny_scene(), out=tmp_path, iterations=5, resume=True)
 
 

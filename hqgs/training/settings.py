@@ -74,7 +74,7 @@ def resumed(folder: Path, now: Said) -> Said:
     if "iterations" in before and "iterations" in now and said["iterations"] < before["iterations"]:
         raise ValueError(
             f"iterations is {said['iterations']}, and the run in {folder} has {before['iterations']}: "
-            "--resume can make it longer, not shorter"
+            "--resume can make a run longer, not shorter"
         )
     return said
 
