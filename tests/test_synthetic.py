@@ -18,7 +18,7 @@ from benchmarks.scenes.room.studio import studio
 from hqgs.scene import known_points, room
 from hqgs.scene.known_points import with_points
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.scene.sfm import triangulated
+from hqgs.scene.sfm import run
 from hqgs.scene.sfm.likely import PARTNERS
 from hqgs.scene.sfm.triangulated import SparsePoints, pairs_of
 
@@ -269,7 +269,7 @@ def test_of_many_views_those_are_matched_that_are_near_and_look_alike() -> None:
 def test_points_when_colmap_is_late_or_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     views = views_of(63, 47, 3)
     points, _, _, _, note = sfm_points(views, time_limit=0)
-    assert note == "4000 points cast onto the surfaces, as COLMAP gave none: it took more than 0 s"
+    assert note == "4000 points cast onto the surfaces, as COLMAP gave none: COLMAP took more than 0 s"
     assert np.quantile(depth_error(views, points[::8]), 0.9) < 0.02
     assert points.tobytes() == surface_points(views).points.tobytes()
     assert points.tobytes() != surface_points(views, seed=1).points.tobytes()
@@ -285,8 +285,8 @@ def test_points_when_colmap_is_late_or_fails(monkeypatch: pytest.MonkeyPatch) ->
 
     flat = [replace(v, image=np.full_like(v.image, 128)) for v in views]
     assert "as COLMAP gave none: it found only 0 points" in sfm_points(flat).note
-    monkeypatch.setattr(triangulated, "PROGRAM", Path("there", "is", "none"))
-    assert "as COLMAP gave none: it ended with status 2" in sfm_points(views).note
+    monkeypatch.setattr(run, "PROGRAM", Path("there", "is", "none"))
+    assert "as COLMAP gave none: COLMAP ended with status 2" in sfm_points(views).note
 
 
 def same_scene(a: Scene, b: Scene) -> bool:

@@ -1,15 +1,15 @@
-"""COLMAP in a process of its own: the program `python program.py COMMAND DIRECTORY`.
+"""COLMAP in a process of its own: the program `python program.py COMMAND DIRECTORY THREADS`.
 
 So a crash or a hang of COLMAP cannot take its caller along. What it imports of hqgs needs nothing else, so
 that it starts at once. DIRECTORY holds `input.npz`: photos (the folder), names [V], and of known cameras
 sizes [V, 2] as width and height and Ks [V, 3, 3], of known poses viewmats [V, 4, 4]. If DIRECTORY has a
 folder `masks`, each photo has a mask `NAME.png` there. COLMAP's files and the answer go into DIRECTORY:
 
-`triangulate`: points for known cameras and poses, from the pairs [P, 2], numbers of photos, where it has
-some, else from all; `points.npz` (points [P, 3] float32, colors [P, 3] uint8,
-and of each observation the numbers of the photo and of the point: photos [O], rows [O]).
+`triangulate`, on one thread: points for known cameras and poses, from the pairs [P, 2], numbers of photos,
+where it has some, else from all; `points.npz` (points [P, 3] float32, colors [P, 3] uint8, and of each
+observation the numbers of the photo and of the point: photos [O], rows [O]).
 
-`reconstruct THREADS`: poses and points, the folder `model` with the largest COLMAP model; none if there is no
+`reconstruct`: poses and points, the folder `model` with the largest COLMAP model; none if there is no
 model. Known cameras stay as they are. Of unknown ones, which are SIMPLE_RADIAL, `input.npz` has sizes [C, 2],
 focal lengths in px, focals [C], 0 where nothing is known, and the number of each photo's camera, camera_of
 [V]; where photos are faces of panoramas, the known focal lengths, and the rotations [F, 3, 3] of the F faces
@@ -100,14 +100,14 @@ def _end_with_caller() -> None:
     os._exit(1)
 
 
-def main(command: str, directory: str, *options: str) -> None:
+def main(command: str, directory: str, threads: str) -> None:
     pycolmap.set_random_seed(0)
+    threading.Thread(target=_end_with_caller, daemon=True).start()
     if command == "triangulate":
         pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)
         triangulate(Path(directory))
     else:
-        threading.Thread(target=_end_with_caller, daemon=True).start()
-        reconstruct(Path(directory), *map(int, options))
+        reconstruct(Path(directory), int(threads))
 
 
 if __name__ == "__main__":

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -213,7 +215,7 @@ def run_colmap(
             (new / "photos").rename(photos)
         given["photos"] = np.array(str(photos))
         np.savez(directory / "input.npz", **given)  # pyright: ignore[reportArgumentType]
-        _run_program(directory, on_stage)
+        run_program("reconstruct", directory, on_stage)
         facts = directory / "facts.json"
         if not (directory / "model" / "images.bin").is_file():
             told = why_few(len(names), _passes(facts)[0])
@@ -242,27 +244,29 @@ def _workplace(kept: Path | None) -> Iterator[Path]:
         shutil.rmtree(directory, ignore_errors=True)
 
 
-def surroundings() -> dict[str, str]:
-    """The environment in which PROGRAM finds hqgs, whatever hqgs was started from, and
-    sums of linear algebra have one order."""
+def run_program(
+    command: str, directory: Path, on_stage: OnStage = silent, time_limit: float = math.inf
+) -> None:
+    """Run a command of PROGRAM in `directory` to its end, at most so many seconds. Whatever ends this process
+    ends it too; it finds hqgs, whatever hqgs was started from, and sums of linear algebra have one order.
+    """
+    program = [sys.executable, str(PROGRAM), command, str(directory), str(get_num_threads())]
     paths = [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")]
     one = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1")
-    return os.environ | one | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
-
-
-def _run_program(directory: Path, on_stage: OnStage) -> None:
-    """Run `reconstruct` in `directory` to its end. Whatever ends this process ends it too."""
-    program = [sys.executable, str(PROGRAM), "reconstruct", str(directory), str(get_num_threads())]
+    own = os.environ | one | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    end = time.monotonic() + time_limit
     with (directory / "log.txt").open("wb") as log:
         process = subprocess.Popen(
-            program, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True, env=surroundings()
+            program, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True, env=own
         )
         try:
             while True:
                 try:
-                    status = process.wait(0.25)
+                    status = process.wait(max(0, min(0.25, end - time.monotonic())))
                     break
                 except subprocess.TimeoutExpired:
+                    if time.monotonic() >= end:
+                        raise ValueError(f"COLMAP took more than {time_limit:g} s") from None
                     _tell(directory / "stage.json", on_stage)
         finally:
             process.kill()

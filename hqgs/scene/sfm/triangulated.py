@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +15,7 @@ from scipy.spatial.distance import cdist
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.scene import View
 from hqgs.scene.sfm.likely import MATCHED_ALL, PARTNERS
-from hqgs.scene.sfm.run import PROGRAM, surroundings
+from hqgs.scene.sfm.run import run_program
 
 ALIKE = 0.5  # cosine of the angle between the directions in which two photos of more must look, at least
 POINTS_WANTED, TRIANGULATION = 200, 1800.0  # below which there is no basis; s for a COLMAP that hangs
@@ -56,19 +54,9 @@ def triangulated(views: Sequence[View], time_limit: float = TRIANGULATION) -> Sp
             given["pairs"] = pairs_of(views)
         np.savez(directory / "input.npz", allow_pickle=False, **given)
         try:
-            done = subprocess.run(
-                [sys.executable, str(PROGRAM), "triangulate", name],
-                capture_output=True,
-                stdin=subprocess.DEVNULL,
-                timeout=time_limit,
-                check=False,
-                env=surroundings(),
-            )
-        except subprocess.TimeoutExpired:
-            return f"it took more than {time_limit:g} s"
-        if done.returncode:
-            last = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
-            return f"it ended with status {done.returncode} {' '.join(last)}".strip()
+            run_program("triangulate", directory, time_limit=time_limit)
+        except ValueError as error:
+            return str(error)
         with np.load(directory / "points.npz", allow_pickle=False) as data:
             points, colors, photos, rows = (data[k] for k in ("points", "colors", "photos", "rows"))
     if len(points) < POINTS_WANTED:
