@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,14 @@ if sys.dont_write_bytecode:  # as in many containers: each of some hundred proce
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+import torch  # noqa: E402  # not before threads are set
+from fixtures_cards import cards, photos  # noqa: E402, F401
+
+import benchmarks.scenes.kinds  # noqa: E402, F401  # tests degrade photos in all ways that the benchmarks know
+import hqgs  # noqa: E402
+
+THREADS = hqgs.get_num_threads(), torch.get_num_threads()
+
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
@@ -36,9 +45,12 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         config.option.dist = "worksteal"
 
 
-def pytest_configure() -> None:
-    """Tests degrade photos in all ways that the benchmarks know."""
-    import benchmarks.scenes.kinds  # noqa: F401  # not before threads are set
+@pytest.fixture(autouse=True)
+def as_many_threads_as_alone() -> Iterator[None]:
+    """What a test sets changes no other."""
+    yield
+    hqgs.set_num_threads(THREADS[0])
+    torch.set_num_threads(THREADS[1])
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

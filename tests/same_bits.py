@@ -156,6 +156,7 @@ def hashed(trainer: Trainer) -> str:
     return sha.hexdigest()[:24]
 
 
+@cache
 def trained(case: Case, stop: int | None = None) -> str:
     """The hash at the end; with `stop` the run is stopped after that step, and resumed."""
     scene, config = case.make()

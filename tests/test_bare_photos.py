@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from fixtures_cards import HEIGHT, WIDTH
+from fixtures_photos import exif, looked_at, picture
 from PIL import Image
-from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
 
 from hqgs.base.stages import Stage
 from hqgs.cli.progress import LoadingScreen
@@ -22,7 +23,6 @@ from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, glance
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.load import load_pictures, load_scene
-from hqgs.scene.scene import Scene
 from hqgs.scene.sfm import passes as all_passes
 from hqgs.scene.sfm import program
 from hqgs.scene.sfm import run as colmap_run
@@ -36,28 +36,6 @@ from hqgs.scene.sfm.run import expected_time
 
 ROOT = Path(__file__).parent.parent
 FINE = PASSES[1]
-
-
-def exif(orientation: int = 1, focal_35mm: int = 0, model: str = "") -> Image.Exif:
-    tags = Image.Exif()
-    tags[274] = orientation
-    if model:
-        tags[272] = model
-    if focal_35mm:
-        tags.get_ifd(0x8769)[41989] = focal_35mm
-    return tags
-
-
-def picture(seed: int, size: tuple[int, int] = (40, 30)) -> Image.Image:
-    rng = np.random.default_rng(seed)
-    return Image.fromarray(rng.integers(0, 256, (size[1], size[0], 3)).astype(np.uint8))
-
-
-@pytest.fixture
-def photos(cards: Scene) -> list[np.ndarray]:  # noqa: F811
-    """The nine photos of the cards, in their order."""
-    views = sorted([*cards.train, *cards.test], key=lambda view: view.name)
-    return [view.image.astype(np.uint8) for view in views]
 
 
 def test_exif_tells_orientation_camera_and_focal_length(tmp_path: Path) -> None:
@@ -86,9 +64,7 @@ def test_photos_share_a_camera_by_size_make_and_zoom(tmp_path: Path) -> None:
         )
     ):
         picture(seed, size).save(tmp_path / f"{name}.jpg", exif=exif(1, focal, "Phone"))
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
-    guess = readable(found).guess()
+    guess = looked_at(tmp_path).guess()
     assert guess.camera_of == [0, 0, 1, 2, 3]
     assert guess.sizes == [(40, 30), (40, 30), (30, 40), (40, 30)]
     assert guess.focals == pytest.approx([32.36, 64.71, 32.36, 0], rel=1e-3)
@@ -157,9 +133,7 @@ def test_colmap_sees_large_photos_smaller_and_what_it_finds_is_at_their_stored_s
     ramp = np.repeat(np.linspace(0, 255, 300).astype(np.uint8)[None, :, None], 200, 0).repeat(3, 2)
     for name, size in (("a.jpg", (300, 200)), ("b.jpg", (200, 300)), ("c.webp", (60, 40))):
         Image.fromarray(ramp).resize(size).save(tmp_path / name, exif=exif(1, 72), quality=95)
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
-    photos = readable(found)
+    photos = looked_at(tmp_path)
     assert photos.guess().sizes == [(300, 200), (200, 300), (60, 40)]
     guess = photos.guess(100)
     assert guess.sizes == [(99, 66), (66, 99), (60, 40)]  # 3:2, exactly

@@ -31,11 +31,7 @@ OPTIONS = ("--degradations", *KINDS, "--iterations", "5")
 
 
 def call(out: Path, *options: str) -> int:
-    before = hqgs.get_num_threads()
-    try:
-        return cli.main(["quality", "--quick", "--threads", "1", "--out", str(out), *options])
-    finally:
-        hqgs.set_num_threads(before)
+    return cli.main(["quality", "--quick", "--threads", "1", "--out", str(out), *options])
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from run_state import run_until
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.cli.main import main
@@ -35,9 +36,7 @@ def scene() -> Scene:
 @cache
 def foggy() -> Gaussians:
     """A trained scene, with opaque blobs of wrong colours halfway between the cameras and the plane."""
-    trainer = Trainer(scene(), tiny_config(150))
-    for _ in range(150):
-        trainer.step()
+    trainer = run_until(Trainer(scene(), tiny_config(150)), 150)
     shown, rng = trainer.shown(), np.random.default_rng(0)
     means = np.concatenate([rng.uniform(-0.7, 0.7, (FOG, 2)), np.full((FOG, 1), 1.5)], 1).astype(np.float32)
     blobs = Gaussians.from_points(means, np.full((FOG, 3), 255, np.uint8), shown.sh_degree)

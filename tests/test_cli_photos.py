@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from test_bare_photos import photos  # noqa: F401
-from test_sfm import cards  # noqa: F401
 
 from hqgs.cli.main import main
 from hqgs.scene.load import load_scene
@@ -20,7 +18,7 @@ def call(*arguments: str | Path) -> int:
 
 
 @pytest.fixture
-def folder(photos: list[np.ndarray], tmp_path: Path) -> Path:  # noqa: F811
+def folder(photos: list[np.ndarray], tmp_path: Path) -> Path:
     """Photos and a text that is none."""
     path = tmp_path / "photos"
     path.mkdir()

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fixtures_photos import looked_at
 from fixtures_scenes import make_truth, write_colmap
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
 from hqgs.photos.files import decode, glance, told_colors
 from hqgs.scene.load import load_scene
-from hqgs.scene.sfm.bare_photos import bare_photos, readable
 
 COLOURS = np.array(
     [[40, 180, 60], [200, 60, 40], [128, 128, 128], [5, 9, 14], [255, 255, 255], [0, 0, 0], [90, 90, 200]],
@@ -352,10 +352,8 @@ def test_all_who_read_photos_get_srgb(tmp_path: Path) -> None:
     scene = load_scene(tmp_path, test_every=0)
     assert np.abs(scene.train[0].image - np.array([40.0, 180, 60])).max() <= 2
     assert "4 of 6 photos are in A camera: they are converted to sRGB" in scene.notes
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
     heard = list[str]()
-    photos = readable(found, lambda stage: heard.append(str(stage)))
+    photos = looked_at(tmp_path, lambda stage: heard.append(str(stage)))
     assert any("photos are in A camera" in text for text in [*heard, *photos.notes])
     photos.write(tmp_path / "copies")
     assert next(iter(photos.colmap_names)) == "view_00.jpg"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fixtures_photos import exif
 from fixtures_scenes import HEIGHT, WIDTH, make_truth, write_colmap
 from numpy.typing import NDArray
 from PIL import Image
@@ -112,9 +113,7 @@ def test_alpha(tmp_path: Path) -> None:
 def test_exif_orientation_is_left_alone(tmp_path: Path) -> None:
     photo = np.zeros((16, 24, 3), np.uint8)
     photo[:, 12:] = 255
-    exif = Image.Exif()
-    exif[0x0112] = 6  # "turn by 90 degrees to show"
-    Image.fromarray(photo).save(tmp_path / "a.png", exif=exif)
+    Image.fromarray(photo).save(tmp_path / "a.png", exif=exif(6))  # "turn by 90 degrees to show"
     np.testing.assert_array_equal(decode(tmp_path / "a.png")[0], photo)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -121,27 +120,12 @@ def test_bad_rows_name_the_photo(tmp_path: Path, index: int, value: float, messa
         load_scene(tmp_path)
 
 
-def test_mirrored_pose(tmp_path: Path) -> None:
-    write_llff(make_truth(), tmp_path)
-    rows = np.load(tmp_path / "poses_bounds.npy")
-    rows[2, [0, 5, 10]] *= -1
-    np.save(tmp_path / "poses_bounds.npy", rows)
-    with pytest.raises(ValueError, match=r"view_02\.png.*no rotation"):
-        load_scene(tmp_path)
-
-
-@pytest.mark.parametrize("kind", ["objects", "huge", "text", "shape", "integers", "empty"])
+@pytest.mark.parametrize("kind", ["objects", "shape", "integers", "empty"])
 def test_bad_poses_file(tmp_path: Path, kind: str) -> None:
     write_llff(make_truth(), tmp_path)
     path = tmp_path / "poses_bounds.npy"
     if kind == "objects":
         np.save(path, np.array([[print] * 17], object), allow_pickle=True)
-    elif kind == "huge":  # a header for 10^12 rows on a file of 9
-        header = np.lib.format.header_data_from_array_1_0(np.load(path)) | {"shape": (10**12, 17)}
-        with path.open("wb") as f:
-            np.lib.format.write_array_header_1_0(f, header)
-    elif kind == "text":
-        path.write_bytes(pickle.dumps([1, 2]))
     elif kind == "shape":
         np.save(path, np.zeros((9, 15)))
     elif kind == "integers":

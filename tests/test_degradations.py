@@ -32,12 +32,6 @@ def degrade(text: str, image: NDArray[np.uint8] | NDArray[np.float32], seed: int
     return degrade_image(image, parse_degradation(text), np.random.default_rng(seed))
 
 
-def impulse(size: int) -> NDArray[np.float32]:
-    image = np.zeros((size, size, 3), np.float32)
-    image[size // 2, size // 2] = 1
-    return image
-
-
 # --- text
 
 
@@ -46,6 +40,8 @@ def impulse(size: int) -> NDArray[np.float32]:
     [
         *("none", "jpeg:5", "noise:0.5", "lowres:4", "blur", "blur:2.5", "defocus", "motion:21", "mixed"),
         *("blur:2+jpeg:20", "jpeg:20+blur:2", "blur+lowres:2+noise:10"),
+        *("shake", "shake:7.5", "exposure:0.5", "chat:640", "phone", "phone:3", "video:23", "video265"),
+        *("some:shake", "some:noise:25", "some:blur+jpeg:30", "shake+exposure+video:30"),
     ],
 )
 def test_text_comes_back(text: str) -> None:
@@ -89,6 +85,22 @@ def test_canonical_text() -> None:
         ("jpeg:5:6", "'5:6' in the degradation 'jpeg:5:6' is not a number"),
         ("none+blur", "'none' cannot be joined with others, got the degradation 'none\\+blur'"),
         ("mixed:3", "unknown degradation 'mixed'"),
+        ("shake:0.1", "shake is 0.1, wanted the longest extent of a shake in px, 0.5..200"),
+        ("exposure:9", "exposure is 9, wanted the largest deviation in stops, 0.01..4"),
+        ("chat:7", "chat is 7, wanted the longest side in px, an integer in 8..10000"),
+        ("phone:-1", "phone is -1, wanted stops of light that are missing, 0..12"),
+        ("video:52", "video is 52, wanted a constant rate factor, an integer in 0..51"),
+        ("video:20.5", "video is 20.5, wanted a constant rate factor, an integer"),
+        ("some", "some takes one of jpeg, noise, blur, .*; got some:$"),
+        ("some:lowres:2", "some takes one of jpeg, noise, blur, .*; got some:lowres"),
+        ("some:video", "got some:video"),
+        ("some:mixed", "got some:mixed"),
+        ("some:fog", "got some:fog"),
+        ("some:noise", "noise needs a value"),
+        ("some:noise:x", "'x' in the degradation 'some:noise:x' is not a number"),
+        ("some:jpeg:0", "jpeg is 0"),
+        ("focus", "focus depends on depths, .*; defocus:R blurs the whole photo"),
+        ("blur+grain", "grain means that each photo has its own noise; some:noise:SIGMA makes such photos"),
     ],
 )
 def test_bad_text_is_refused(text: str, message: str) -> None:
@@ -161,22 +173,6 @@ def test_jpeg_is_pillows_round_trip(quality: int) -> None:
     np.testing.assert_array_equal(result.image * 255, np.asarray(Image.open(file)))
 
 
-def sampling_factors(data: bytes) -> list[tuple[int, int]]:
-    """(horizontal, vertical) of each component, from the frame header of a JPEG file (ITU T.81, B.2.2)."""
-    at = 2
-    while data[at + 1] not in (0xC0, 0xC1, 0xC2):
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    count = data[at + 9]
-    factors = [data[at + 11 + 3 * i] for i in range(count)]
-    return [(f >> 4, f & 15) for f in factors]
-
-
-def test_jpeg_halves_the_chroma_both_ways() -> None:
-    data = degrade("jpeg:95", photo()).jpeg
-    assert data is not None
-    assert sampling_factors(data) == [(2, 2), (1, 1), (1, 1)]
-
-
 def test_jpeg_clips_and_rounds_its_input() -> None:
     rng = np.random.default_rng(3)
     wild = rng.uniform(-0.5, 1.5, (24, 32, 3)).astype(np.float32)
@@ -233,25 +229,13 @@ def test_later_steps_happen_to_the_small_photo() -> None:
 # --- blur
 
 
-@pytest.mark.parametrize("sigma", [0.4, 1.0, 2.5, 4.0])
-def test_blur_of_an_impulse_is_the_gaussian(sigma: float) -> None:
-    blurred = gaussian_blur(impulse(49), sigma)
-    y, x = np.mgrid[-24:25, -24:25]
-    gaussian = np.exp(-(x**2 + y**2) / (2 * sigma**2))
-    gaussian /= gaussian.sum()
-    for channel in range(3):
-        assert np.abs(blurred[..., channel] - gaussian).max() < 2e-4 * gaussian.max()
-    assert abs(blurred[..., 0].sum() - 1) < 1e-6
-    if sigma >= 1:  # below, sampling the Gaussian makes it narrower than sigma
-        assert abs(math.sqrt((blurred[..., 0] * x**2).sum()) / sigma - 1) < 1e-3
-
-
-def test_blur_mirrors_the_border_without_repeating_the_edge() -> None:
+@pytest.mark.parametrize("sigma", [0.4, 1.0, 1.5, 4.0])
+def test_blur_is_the_gaussian_and_mirrors_the_border_without_repeating_the_edge(sigma: float) -> None:
     image = np.random.default_rng(4).random((20, 26, 3), np.float32)
     expected = ndimage.gaussian_filter(
-        image.astype(np.float64), (1.5, 1.5, 0), mode="mirror", truncate=4.0
+        image.astype(np.float64), (sigma, sigma, 0), mode="mirror", truncate=4.0
     )  # scipy's name of this border
-    np.testing.assert_allclose(gaussian_blur(image, 1.5), expected, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(gaussian_blur(image, sigma), expected, rtol=0, atol=1e-7)
 
 
 def test_convolve_is_the_direct_sum() -> None:
@@ -286,32 +270,10 @@ def test_disc(radius: float) -> None:
         assert kernel.tolist() == [[1.0]]  # nothing happens
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.3, math.pi / 4, math.pi / 2, 2.2, 3.1])
-@pytest.mark.parametrize("length", [1.0, 7.0, 15.5])
-def test_motion_is_a_line_of_the_stated_length_and_direction(length: float, angle: float) -> None:
-    kernel = motion_kernel(length, angle)
-    reach = kernel.shape[0] // 2
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    assert (kernel >= 0).all()
-    assert abs(kernel.sum() - 1) < 1e-12
-    np.testing.assert_allclose(kernel, kernel[::-1, ::-1], rtol=0, atol=1e-14)
-    along = x * math.cos(angle) + y * math.sin(angle)
-    across = y * math.cos(angle) - x * math.sin(angle)
-    # A uniform line has the variance length^2 / 12; bilinear weights add at most a quarter.
-    assert -1e-9 < (kernel * along**2).sum() - length**2 / 12 < 0.25
-    assert (kernel * across**2).sum() < 0.25
-    assert abs(along[kernel > 0]).max() < length / 2 + math.sqrt(2)
-    assert abs(across[kernel > 0]).max() < math.sqrt(2)
-    if length > 1:
-        assert abs(along[kernel > 0]).max() > length / 2 - 0.5
-        covariance = np.array([[(kernel * a * b).sum() for a in (x, y)] for b in (x, y)])
-        axis = np.linalg.eigh(covariance)[1][:, 1]
-        assert abs(axis @ [math.cos(angle), math.sin(angle)]) > 0.999
-
-
-def test_motion_is_the_mean_over_shifts() -> None:
-    image = np.random.default_rng(6).random((41, 43))
-    length, angle, shots = 9.0, 0.7, 400
+@pytest.mark.parametrize("angle", [0.0, 0.7, math.pi / 2, 2.2])
+@pytest.mark.parametrize("length", [1.0, 9.0, 15.5])
+def test_motion_is_the_mean_over_shifts(length: float, angle: float) -> None:
+    image, shots = np.random.default_rng(6).random((41, 43)), 400
     mean = np.zeros_like(image)
     for t in ((np.arange(shots) + 0.5) / shots - 0.5) * length:
         mean += (
@@ -322,7 +284,7 @@ def test_motion_is_the_mean_over_shifts() -> None:
 
 
 def test_motion_draws_its_direction() -> None:
-    still, again, other = (degrade("motion:9", impulse(31), seed).image for seed in (0, 0, 1))
+    still, again, other = (degrade("motion:9", photo(), seed).image for seed in (0, 0, 1))
     np.testing.assert_array_equal(still, again)
     assert np.abs(still - other).max() > 0.01
 
@@ -372,12 +334,8 @@ def test_the_same_seed_gives_the_same_bits(text: str) -> None:
     clean = photo()
     kept = clean.copy()
     first = degrade(text, clean)
-    threads = torch.get_num_threads()
     torch.set_num_threads(3)
-    try:
-        second = degrade(text, (clean / 255).astype(np.float32))
-    finally:
-        torch.set_num_threads(threads)
+    second = degrade(text, (clean / 255).astype(np.float32))
     np.testing.assert_array_equal(first.image, second.image)
     np.testing.assert_array_equal(clean, kept)
 

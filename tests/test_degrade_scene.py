@@ -18,7 +18,8 @@ from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.jpeg import encode_jpeg
 from hqgs.photos.pixels import to_uint8
-from hqgs.scene.degrade import degrade_scene, write_degraded_scene
+from hqgs.scene.degrade import degrade_scene, degraded_views, write_degraded_scene
+from hqgs.scene.formats.degradation_json import read_degraded_folder
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, TrackStatistics
 
@@ -32,6 +33,12 @@ KINDS = [
     "motion:5",
     "mixed",
     "jpeg:9+blur:1",
+    "exposure",
+    "chat:12",
+    "phone:2",
+    "video:30",
+    "some:shake:2",
+    "some:phone+shake:1",
 ]
 
 
@@ -81,13 +88,6 @@ def test_defaults_are_in_the_note_in_pixels() -> None:
     assert note.startswith(
         "degradation mixed (blur:0.11904761904761904+lowres:2+noise:10+jpeg:20 at a width of 24 px), seed 0: "
     )
-
-
-def test_lowres_keeps_the_small_photo() -> None:
-    for view in degrade(tiny_scene(), "lowres:4").train:
-        assert view.low is not None
-        assert view.low.shape == (4, 6, 3)
-        assert view.image.shape == (16, 24, 3)
 
 
 def test_a_photo_depends_on_the_seed_and_its_place_only() -> None:
@@ -143,6 +143,8 @@ def test_a_written_scene_tells_which_photos_show_which_points(tmp_path: Path) ->
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_written_scene_reads_back(tmp_path: Path, kind: str) -> None:
+    if "video" in kind:
+        pytest.importorskip("av")
     scene = colmap_scene(tmp_path)
     memory = degrade(scene, kind, seed=2)
     back = load_scene(write(scene, tmp_path / "out", kind, seed=2), test_every=3)  # the folder's split counts
@@ -168,13 +170,17 @@ def test_a_written_scene_reads_back(tmp_path: Path, kind: str) -> None:
             assert new.low.dtype == np.float32
             np.testing.assert_array_equal(to_uint8(new.low), to_uint8(old.low))
 
-    facts = json.loads((tmp_path / "out" / "degradation.json").read_text())
-    assert (facts["kind"], facts["seed"]) == (kind, 2)
-    assert list(facts["train"]) == [v.name for v in back.train]
-    assert facts["held_out"] == [v.name for v in back.test]
+    folder = read_degraded_folder(tmp_path / "out")
+    assert folder is not None
+    assert (folder.kind, folder.seed) == (kind, 2)
+    assert list(folder.train) == [v.name for v in back.train]
+    assert folder.held_out == [v.name for v in back.test]
+    results = [result for _, result in degraded_views(scene, parse_degradation(kind), 2)]
+    assert folder.steps == {v.name: r.records for v, r in zip(back.train, results, strict=True)}
     (note,) = back.notes
     assert note.startswith(f"degradation {kind}")
-    assert "seed 2: all training photos (7), " in note
+    hit = "4 of 7 training photos" if kind == "some:shake:2" else "all training photos (7)"
+    assert f"seed 2: {hit}, " in note
 
 
 def test_jpeg_files_are_the_codecs_own(tmp_path: Path) -> None:
@@ -316,6 +322,10 @@ def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str) -> 
         ({"train": {"view1.png": "images/../low/view9.png"}}, "has no small photo"),
         ({"train": {"view1.png": "large.png"}}, r"large\.png is 25 x 16, its photo 24 x 16"),
         ({"more": 1}, "is damaged: .*more"),
+        ({"version": 3}, "is damaged: the version is 3, and only 1 and 2 are known"),
+        ({"steps": []}, "steps must be an object"),
+        ({"steps": {"view1.png": {}}}, r"the steps of 'view1\.png' are {}"),
+        ({"steps": {"view1.png": ["blur"]}}, r"the steps of 'view1\.png' are \['blur'\]"),
     ],
 )
 def test_a_damaged_description_is_refused(

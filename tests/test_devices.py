@@ -11,7 +11,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from test_learned_cameras import assert_same, run
+from run_state import assert_stopped_alike
+from test_learned_cameras import learned_config
 from tiny_scene import tiny_scene
 
 import hqgs
@@ -25,6 +26,7 @@ from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.look import STEEPEST, Look, as_a_lens, darken, falloff, respond, squared_radii
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.methods.cameras import KEPT, LearnedCameras, LearnedDevices
+from hqgs.training.trainer import Trainer
 
 Floats = NDArray[np.float64]
 K = np.array([[40.0, 0, 17.5], [0, 40.0, 11.0], [0, 0, 1]])
@@ -264,15 +266,8 @@ def by_two() -> Scene:
 
 @pytest.mark.parametrize("formation", ["vignetting+response", "exposure+vignetting+response+shake"])
 def test_a_run_learns_them_bit_for_bit(formation: str, tmp_path: Path) -> None:
-    before, runs = hqgs.get_num_threads(), []
-    try:
-        for threads in (1, 3):
-            hqgs.set_num_threads(threads)
-            runs.append(run(by_two(), formation))
-    finally:
-        hqgs.set_num_threads(before)
-    assert_same(*runs)
-    learned = runs[0].method.learned()
+    whole = assert_stopped_alike(lambda: Trainer(by_two(), learned_config(formation)), tmp_path, 17)
+    learned = whole.method.learned()
     assert any(np.abs(photo.response).max() > 1e-3 for photo in learned)
     np.testing.assert_allclose(np.mean([photo.response for photo in learned], 0), 0, atol=1e-9)
 
@@ -300,9 +295,6 @@ def test_a_new_view_in_the_look_of_a_photo(tmp_path: Path, capsys: pytest.Captur
     assert main(["render", str(out), "--out", str(tmp_path / "x"), "--look", "view9"]) == 2
     assert "no exposure of a photo 'view9' was learned; there are: view1.png, " in capsys.readouterr().err
     assert main(["render", str(out / "scene.ply"), "--out", str(tmp_path / "x.png"), "--look", "view1"]) == 0
-    wrong = ["--show", "depth", "--look", "view1"]
-    assert main(["render", str(out), "--out", str(tmp_path / "x.png"), *wrong]) == 2
-    assert "--look is for --show color, and --show is depth" in capsys.readouterr().err
     for record in report["learned"]:
         record |= {"gains": [1.0] * 3, "vignetting": [0.0] * 2, "response": [[0.1] * 3, [0.0] * 3]}
     (out / "report.json").write_text(json.dumps(report))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from run_state import run_until
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.evaluation import held_out
@@ -78,9 +79,7 @@ def test_a_run_with_few_views_measures_all_of_them(tmp_path: Path) -> None:
 
 def test_stopped_where_some_were_measured() -> None:
     """The entry of the same iteration gives way to one of all views."""
-    trainer = Trainer(scene_of(4, 6), tiny_config(30, eval_every=10))
-    for _ in range(10):
-        trainer.step()
+    trainer = run_until(Trainer(scene_of(4, 6), tiny_config(30, eval_every=10)), 10)
     trainer.evaluate()
     assert trainer.history[-1].get("views") == 1
     trainer.evaluate(trainer.held_out())

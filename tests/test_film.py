@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 from test_diagnose import clean_photo
-from test_sfm import cards  # noqa: F401
 
 from hqgs.base.stages import Stage
 from hqgs.diagnosis.scene import diagnose_scene
@@ -161,7 +160,7 @@ def test_frames_tell_what_the_codec_left_of_fine_details(tmp_path: Path) -> None
     assert details == pytest.approx([fine_detail(photo.astype(np.float64)) for photo in photos], abs=0.05)
 
 
-def test_a_scene_from_a_film_knows_it_at_about_its_size(cards: Scene, tmp_path: Path) -> None:  # noqa: F811
+def test_a_scene_from_a_film_knows_it_at_about_its_size(cards: Scene, tmp_path: Path) -> None:
     views = sorted([*cards.train, *cards.test], key=lambda view: view.name)
     source = encoded(tmp_path / "walk.mp4", [view.image.astype(np.uint8) for view in views], 20)
     scene = load(source, frames=len(views), cache=tmp_path)

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures_photos import exif, looked_at
 from fixtures_scenes import make_truth, write_colmap
 from PIL import Image, ImageDraw
 
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import decode, decode_mask, glance
 from hqgs.scene.load import load_scene
-from hqgs.scene.sfm.bare_photos import bare_photos, readable
 
 RED = Image.fromarray(np.full((64, 96, 3), (200, 60, 90), np.uint8))
 
@@ -25,9 +25,7 @@ def test_a_jpeg_called_heic_is_a_jpeg(tmp_path: Path, monkeypatch: pytest.Monkey
     for k in range(3):
         RED.resize((96, 64 + 8 * k)).save(tmp_path / f"{k}.HEIC", "jpeg")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
-    assert readable(found).names == ["0.HEIC", "1.HEIC", "2.HEIC"]
+    assert looked_at(tmp_path).names == ["0.HEIC", "1.HEIC", "2.HEIC"]
     assert np.abs(decode(tmp_path / "0.HEIC")[0].mean((0, 1)) - (200, 60, 90)).max() < 4
 
 
@@ -51,9 +49,7 @@ def test_colmap_is_given_what_it_reads(tmp_path: Path) -> None:
     RED.save(tmp_path / "b.jpg", "webp")
     RED.save(tmp_path / "c.jpg", "png")
     RED.save(tmp_path / "d.HEIC", "jpeg")
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
-    photos = readable(found)
+    photos = looked_at(tmp_path)
     names = ["a.jpg", "b.jpg", "c.jpg", "d.HEIC.jpg"]
     assert list(photos.colmap_names) == names
     (tmp_path / "out").mkdir()
@@ -98,9 +94,7 @@ def test_masks_of_zero_and_one_labels_and_alpha(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("orientation", "turn"), [(0, 0), (1, 0), (6, 1), (8, 3), (9, 0), (255, 0)])
 def test_orientations_that_there_are_none_of(tmp_path: Path, orientation: int, turn: int) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    RED.save(tmp_path / "a.jpg", exif=exif)
+    RED.save(tmp_path / "a.jpg", exif=exif(orientation))
     assert read_exif(tmp_path / "a.jpg").quarter_turns == turn
     assert glance(tmp_path / "a.jpg").size == (96, 64)
 
@@ -109,15 +103,13 @@ def test_the_pictures_of_a_run_are_no_photos(tmp_path: Path) -> None:
     """Of a finished one, of one that has just begun, and of what COLMAP keeps in it."""
     for k in range(3):
         (tmp_path / "photos").mkdir(exist_ok=True)
-        RED.save(tmp_path / f"photos/{k}.jpg")
+        RED.resize((96, 64 + 8 * k)).save(tmp_path / f"photos/{k}.jpg")
     for run, files in {"run": ("config.json", "scene.ply"), "begun": (".lock",)}.items():
         (tmp_path / run / "comparison").mkdir(parents=True)
         for name in files:
             (tmp_path / run / name).write_text("{}")
         RED.save(tmp_path / run / "comparison/a.png")
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
-    assert found.names == ["0.jpg", "1.jpg", "2.jpg"]
+    assert looked_at(tmp_path).names == ["0.jpg", "1.jpg", "2.jpg"]
     with pytest.raises(ValueError, match="run that hqgs wrote"):
         load_scene(tmp_path / "run")
 
@@ -125,9 +117,7 @@ def test_the_pictures_of_a_run_are_no_photos(tmp_path: Path) -> None:
 def test_colmap_bears_orientations_that_there_are_none_of(tmp_path: Path) -> None:
     """In a process of its own: some versions abort."""
     for k, orientation in enumerate((0, 9, 6)):
-        exif = Image.Exif()
-        exif[0x0112] = orientation
-        RED.save(tmp_path / f"{k}.jpg", exif=exif)
+        RED.save(tmp_path / f"{k}.jpg", exif=exif(orientation))
     code = (
         "import pycolmap; from pathlib import Path; root = Path(" + repr(str(tmp_path)) + ");"
         "pycolmap.extract_features(root / 'a.db', root);"

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from test_covariances import covariances as of_axes
 from test_formats import change_gltf, random_gaussians
 
 from hqgs.model.gaussians import Gaussians
@@ -129,14 +130,7 @@ def test_nodes_turn_stretch_and_move(tmp_path: Path, node: dict[str, Any], linea
 
 
 def covariances(g: Gaussians) -> np.ndarray:
-    w, x, y, z = torch.nn.functional.normalize(g.quats, dim=1).double().T
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    factors = torch.stack(rows, 1) * g.activated_scales().double()[:, None]
-    return (factors @ factors.mT).numpy()
+    return of_axes(g.quats.double(), g.activated_scales().double()).numpy()
 
 
 def colours(g: Gaussians, k: int, direction: np.ndarray) -> np.ndarray:

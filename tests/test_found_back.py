@@ -36,11 +36,9 @@ def test_they_lie_on_the_surface_and_are_the_same_for_any_number_of_threads() ->
     agreement = Agreement(SCENE.train, SCENE.seen)
     along = points_along_edges(SCENE.train, SCENE.points, SCENE.seen, 800, 0, agreement)
     assert agreed == along[2]  # rules go by the share of the first look
-    before = hqgs.get_num_threads()
     for threads in (1, 3):
         hqgs.set_num_threads(threads)
         np.testing.assert_array_equal(found(SCENE.train)[0], points)
-    hqgs.set_num_threads(before)
 
 
 def test_two_photos_are_enough_and_must_find_each_other() -> None:

@@ -7,23 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fixtures_cards import HEIGHT, WIDTH
+from fixtures_photos import exif, looked_at, picture
 from fixtures_scenes import make_truth, write_transforms
 from PIL import Image
-from test_bare_photos import exif, picture
-from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
 
 from hqgs.base.stages import Stage
 from hqgs.photos.exif import read_exif
 from hqgs.scene.load import load_scene
-from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
 from hqgs.scene.sfm.folder import write_colmap_folder
 from hqgs.scene.source import load, pictures
-
-
-def looked_at(folder: Path) -> BarePhotos:
-    found = bare_photos(folder, 1)
-    assert found is not None
-    return readable(found)
 
 
 def test_of_copies_one_is_used_and_the_others_are_named(tmp_path: Path) -> None:
@@ -36,9 +29,7 @@ def test_of_copies_one_is_used_and_the_others_are_named(tmp_path: Path) -> None:
     changed.putpixel((4, 5), (1, 2, 3))
     changed.save(tmp_path / "closer.png")
     stages: list[Stage] = []
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
-    photos = readable(found, stages.append)
+    photos = looked_at(tmp_path, stages.append)
     assert photos.names == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg", "close.png", "closer.png"]
     assert len(photos.sizes) == len(photos.exif) == 5
     assert photos.notes == [
@@ -108,26 +99,15 @@ def test_photos_in_folders_below_others_are_told(tmp_path: Path) -> None:
         ({1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)}, None),  # no fix
         ({1: "N", 2: (95.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 1.0)}, None),
         ({1: "N", 2: (5.0, 0.0, 0.0)}, None),
+        ({1: "N", 2: (5.0, 0.0, 0.0), 3: "E", 4: (6.0, 0.0, 0.0)}, (5, 6, np.nan)),  # no altitude
     ],
 )
 def test_exif_tells_the_place(
     tags: dict[int, object], wanted: tuple[float, float, float] | None, tmp_path: Path
 ) -> None:
-    own = Image.Exif()
-    own.get_ifd(0x8825).update(tags)
-    picture(0).save(tmp_path / "a.jpg", exif=own)
+    picture(0).save(tmp_path / "a.jpg", exif=exif(gps=tags))
     found = read_exif(tmp_path / "a.jpg").gps
-    assert found == (None if wanted is None else pytest.approx(wanted, abs=1e-9))
-
-
-def test_a_place_without_altitude_or_of_zeros_over_zeros(tmp_path: Path) -> None:
-    own = Image.Exif()
-    own.get_ifd(0x8825).update({1: "N", 2: (5.0, 0.0, 0.0), 3: "E", 4: (6.0, 0.0, 0.0)})
-    picture(0).save(tmp_path / "a.jpg", exif=own)
-    found = read_exif(tmp_path / "a.jpg").gps
-    assert found is not None
-    assert found[:2] == (5, 6)
-    assert found[2] != found[2]
+    assert found == (None if wanted is None else pytest.approx(wanted, abs=1e-9, nan_ok=True))
 
 
 def test_masks_are_looked_at_before_colmap_works(tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from run_state import assert_stopped_alike, run_until
 from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
-import hqgs
 from hqgs.base.left_out import CORRECTION, DIAGNOSIS, PHOTO, LeftOut, format_left_out
 from hqgs.base.ranks import ALONE
 from hqgs.pipeline import train
@@ -27,14 +27,7 @@ STILL = DensifyConfig(start=10_000, reset_every=10_000)
 
 
 def run(scene: Scene, iterations: int, *items: str, **changes: object) -> Trainer:
-    trainer = Trainer(scene, tiny_config(iterations, leave_out=items, **changes))
-    while trainer.iteration < trainer.length:
-        trainer.step()
-    return trainer
-
-
-def bits(trainer: Trainer) -> dict[str, bytes]:
-    return {name: t.detach().numpy().tobytes() for name, t in trainer.gaussians.named().items()}
+    return run_until(Trainer(scene, tiny_config(iterations, leave_out=items, **changes)))
 
 
 def test_the_items_by_name() -> None:
@@ -160,29 +153,14 @@ def test_photos_of_which_masks_leave_nothing_do_not_count(monkeypatch: pytest.Mo
 
     assert psnr(range(len(views))) == psnr(others)
     assert np.isnan(psnr([held]))
-    while trainer.iteration < trainer.length:
-        trainer.step()
-    assert trainer.length == 30
+    assert run_until(trainer).length == 30
     assert left_out_of(trainer.state.rows) == []
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rules, "SMALLEST_SIDE", 8)
-    items = ("growth", "resolution")
-    scene, config = tiny_scene(VIEWS), tiny_config(60, leave_out=items, sh_interval=6)
-    whole = Trainer(scene, config)
-    for k in range(60):
-        whole.step()
-        if k in (10, 30, 50):
-            whole.save(tmp_path / f"{k}.safetensors")
-    for k in (10, 30, 50):
-        again = Trainer(scene, config)
-        again.restore(tmp_path / f"{k}.safetensors")
-        while again.iteration < again.length:
-            again.step()
-        assert bits(again) == bits(whole)
-        told = [item.what for item in again.left_out()]
-        assert told == [item.what for item in whole.left_out()]
+    scene, config = tiny_scene(VIEWS), tiny_config(60, leave_out=("growth", "resolution"), sh_interval=6)
+    assert_stopped_alike(lambda: Trainer(scene, config), tmp_path, 11, 31, 51)
 
 
 def test_the_report_tells_what_was_left_out(tmp_path: Path) -> None:
@@ -212,14 +190,3 @@ def test_the_table_begins_with_photos_and_has_five_lines() -> None:
     assert [line.split()[0] for line in lines[1:]] == ["a", "diagnosis", "diagnosis", "diagnosis"]
     many = format_left_out([LeftOut(str(k), "") for k in range(9)]).splitlines()[1:]
     assert [" ".join(line.split()) for line in many[3:]] == ["3", "and 5 more the report has them all"]
-
-
-def test_the_number_of_threads_changes_no_bit() -> None:
-    before, results = hqgs.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            hqgs.set_num_threads(threads)
-            results.append(bits(run(tiny_scene(VIEWS), 40, "growth")))
-    finally:
-        hqgs.set_num_threads(before)
-    assert results[0] == results[1]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fixtures_photos import exif
 from fixtures_scenes import make_truth, write_colmap
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -57,21 +58,19 @@ def test_what_gps_cannot_tell_is_not_told() -> None:
     assert georeference(np.outer(np.arange(12.0), [1, 2, 3]), gps) is None  # on a line
 
 
+def place_of(east: float, north: float, height: float) -> dict[int, object]:
+    """EXIF's GPS so many metres from the origin."""
+    north, east = NORTH + north / METRES[0], EAST + east / METRES[1]
+    return {1: "N", 2: (north, 0.0, 0.0), 3: "E", 4: (east, 0.0, 0.0), 5: b"\0", 6: height}
+
+
 def test_photos_with_gps_say_where_the_scene_is(tmp_path: Path) -> None:
     truth = make_truth(suffix=".jpg")
     root = write_colmap(truth, tmp_path, binary=False)
     for name, viewmat in zip(truth.names, truth.viewmats, strict=True):
         x, y, z = (-viewmat[:3, :3].T @ viewmat[:3, 3]).tolist()  # 5 m to the unit; up is -y, north z
-        tags = Image.Exif()
-        place = {
-            1: "N",
-            2: (NORTH + 5 * z / METRES[0], 0.0, 0.0),
-            3: "E",
-            4: (EAST + 5 * x / METRES[1], 0.0, 0.0),
-        }
-        tags.get_ifd(0x8825).update({**place, 5: b"\0", 6: 320 - 5 * y})
         with Image.open(root / "images" / name) as photo:
-            photo.save(root / "images" / name, exif=tags)
+            photo.save(root / "images" / name, exif=exif(gps=place_of(5 * x, 5 * z, 320 - 5 * y)))
     scene = load_scene(root)
     assert scene.place is not None
     assert scene.world.place == scene.place
@@ -96,11 +95,7 @@ def test_drones_tell_their_height_and_how_the_camera_was_held(tmp_path: Path) ->
     root = write_colmap(truth, tmp_path, binary=False)
     for k, (name, viewmat) in enumerate(zip(truth.names, truth.viewmats, strict=True)):
         x, y, z = (-viewmat[:3, :3].T @ viewmat[:3, 3]).tolist()
-        tags = Image.Exif()
-        north, east = NORTH + 50 * z / METRES[0], EAST + 50 * x / METRES[1]
-        height = 320 - 50 * y + 20 * (-1) ** k
-        place = {1: "N", 2: (north, 0.0, 0.0), 3: "E", 4: (east, 0.0, 0.0), 5: b"\0", 6: height}
-        tags.get_ifd(0x8825).update(place)
+        tags = exif(gps=place_of(50 * x, 50 * z, 320 - 50 * y + 20 * (-1) ** k))
         with Image.open(root / "images" / name) as photo:
             photo.save(root / "images" / name, exif=tags, xmp=xmp(80 - 50 * y, -37.5))
     found = read_exif(root / "images" / truth.names[0])

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from example_method import install
+from run_state import run_until
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
@@ -85,9 +86,7 @@ def test_gaussians_with_a_bad_gradient_are_named_and_culled(
     faulty: Faulty, tensor: str, value: float
 ) -> None:
     faulty.tensor, faulty.rows, faulty.value = tensor, [3, 17], value
-    trainer = Trainer(tiny_scene(), tiny_config(method="faulty", densify=ONLY_TRAIN))
-    for _ in range(3):
-        trainer.step()
+    trainer = run_until(Trainer(tiny_scene(), tiny_config(method="faulty", densify=ONLY_TRAIN)), 3)
     before = values(trainer)
     moments = trainer.state.optimizer.state[trainer.gaussians.means]["exp_avg"].clone()
     step = trainer.step()
@@ -149,9 +148,7 @@ def test_a_bad_parameter_is_culled_and_the_others_train_as_if_it_had_not_been(
 
 def test_children_that_would_lie_nowhere_are_culled() -> None:
     """exp(88.7) is about the largest float: the children of a Gaussian of that size lie at infinity."""
-    trainer = Trainer(tiny_scene(), tiny_config())
-    for _ in range(7):
-        trainer.step()
+    trainer = run_until(Trainer(tiny_scene(), tiny_config()), 7)
     with torch.no_grad():
         trainer.gaussians.scales[4] = 88.7
         trainer.gaussians.shN[9, 2, 1] = torch.nan  # this tensor is looked at where rows change
@@ -203,9 +200,7 @@ def test_an_unexplained_loss_names_the_view(faulty: Faulty, monkeypatch: pytest.
 
 def test_a_method_s_own_gradient_is_named_and_costs_no_gaussian(faulty: Faulty) -> None:
     faulty.tensor = "offset"
-    trainer = Trainer(tiny_scene(), tiny_config(method="faulty", densify=ONLY_TRAIN))
-    for _ in range(6):
-        trainer.step()
+    trainer = run_until(Trainer(tiny_scene(), tiny_config(method="faulty", densify=ONLY_TRAIN)), 6)
     (event,) = trainer.guard.events
     assert (event["what"], event["tensors"], event["count"]) == ("gradient", ["offset"], 0)
     assert (trainer.guard.skipped, trainer.guard.culled, len(trainer.gaussians)) == (1, 0, 40)
@@ -229,9 +224,7 @@ def test_many_events_are_counted_and_the_first_kept(faulty: Faulty) -> None:
 
 def test_what_the_guard_knows_outlives_a_checkpoint(faulty: Faulty, tmp_path: Path) -> None:
     faulty.tensor, faulty.rows = "sh0", [1]
-    trainer = Trainer(tiny_scene(), tiny_config(method="faulty"))
-    for _ in range(5):
-        trainer.step()
+    trainer = run_until(Trainer(tiny_scene(), tiny_config(method="faulty")), 5)
     trainer.save(tmp_path / CHECKPOINT)
     again = Trainer(tiny_scene(), tiny_config(method="faulty"))
     again.restore(tmp_path / CHECKPOINT)

@@ -9,7 +9,6 @@ import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
-from test_sfm import cards  # noqa: F401
 from test_sharpen import made  # noqa: F401
 
 from hqgs.scene.scene import Scene
@@ -73,7 +72,7 @@ def test_a_part_that_lies_wrong_as_a_whole_is_told(made: Made, monkeypatch: pyte
 
 
 @pytest.fixture
-def attempt(cards: Scene, tmp_path: Path) -> Attempt:  # noqa: F811
+def attempt(cards: Scene, tmp_path: Path) -> Attempt:
     """A pass over the cards' photos, all of which have a place."""
     views = {f"{k:05d}.png": view for k, view in enumerate(cards.train)}
     (tmp_path / "photos").mkdir()

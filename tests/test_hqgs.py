@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from example_method import loss_of
+from run_state import assert_stopped_alike, run_until
 from scipy.fft import dctn
 from test_diagnose import half_noisy_scene
 from test_srgs import fine_scene
@@ -295,9 +296,7 @@ def test_blurred_photos_give_a_sharper_scene_than_3dgs() -> None:
     found = {}
     for method in ("3dgs", "hqgs"):
         config = tiny_config(250, method=method, hqgs=fixed("blur:2"), densify=DensifyConfig(stop=0))
-        trainer = Trainer(blurred, config)
-        for _ in range(250):
-            trainer.step()
+        trainer = run_until(Trainer(blurred, config), 250)
         found[method] = psnr_of(trainer, photos, scene)
     assert found["hqgs"] > found["3dgs"] + 1
 
@@ -310,22 +309,9 @@ def psnr_of(trainer: Trainer, photos: list, scene: Scene) -> float:
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "hqgs.training.methods.hqgs.SIZES_REFRESH", 4
-    )  # some of it between the save and the end
-    config = tiny_config(20, method="hqgs", hqgs=fixed("blur:1"))
-    whole, first, second = (Trainer(tiny_scene(), config) for _ in range(3))
-    for _ in range(20):
-        whole.step()
-    for _ in range(11):
-        first.step()
-    first.save(tmp_path / "checkpoint")
-    second.restore(tmp_path / "checkpoint")
-    list(second.held_out())  # looking changes nothing
-    for _ in range(9):
-        second.step()
-    for name, tensor in whole.gaussians.named().items():
-        assert torch.equal(tensor, second.gaussians.named()[name]), name
+    monkeypatch.setattr("hqgs.training.methods.hqgs.SIZES_REFRESH", 4)  # some between the stop and the end
+    config = tiny_config(20, method="hqgs", hqgs=fixed("blur:1+noise:9"))
+    assert_stopped_alike(lambda: Trainer(tiny_scene(), config), tmp_path, 11)
 
 
 def test_photo_pixels_are_those_of_the_nearest_view_that_sees_the_mean() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from run_state import assert_stopped_alike, run_until
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
@@ -255,47 +256,12 @@ def learned_config(formation: str, **changes: Any) -> Any:
 
 
 def run(scene: Scene, formation: str, **changes: Any) -> Trainer:
-    trainer = Trainer(scene, learned_config(formation, **changes))
-    while trainer.iteration < trainer.length:
-        trainer.step()
-    return trainer
-
-
-def state(trainer: Trainer) -> dict[str, torch.Tensor]:
-    return trainer.gaussians.named() | trainer.method.state_dict()
-
-
-def assert_same(a: Trainer, b: Trainer) -> None:
-    first, second = state(a), state(b)
-    assert first.keys() == second.keys()
-    for name, tensor in first.items():
-        assert torch.equal(tensor, second[name]), name
+    return run_until(Trainer(scene, learned_config(formation, **changes)))
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path) -> None:
     scene = hqgs.degrade(tiny_scene(), "shake:3+exposure")
-    whole = run(scene, "shake+focus+exposure")
-    half = Trainer(scene, learned_config("shake+focus+exposure"))
-    while half.iteration < 17:
-        half.step()
-    half.save(tmp_path / "checkpoint.safetensors")
-    rest = Trainer(scene, learned_config("shake+focus+exposure"))
-    rest.restore(tmp_path / "checkpoint.safetensors")
-    while rest.iteration < rest.length:
-        rest.step()
-    assert_same(whole, rest)
-
-
-def test_the_number_of_threads_changes_no_bit() -> None:
-    scene = hqgs.degrade(tiny_scene(), "shake:3+exposure")
-    before, runs = hqgs.get_num_threads(), []
-    try:
-        for threads in (1, 3):
-            hqgs.set_num_threads(threads)
-            runs.append(run(scene, "shake+focus+exposure"))
-    finally:
-        hqgs.set_num_threads(before)
-    assert_same(*runs)
+    assert_stopped_alike(lambda: Trainer(scene, learned_config("shake+focus+exposure")), tmp_path, 17)
 
 
 def test_gains_keep_their_mean_and_come_near_the_truth() -> None:
@@ -321,10 +287,7 @@ def moved_along(scene: Scene, ways: Sequence[NDArray[np.float64]]) -> Scene:
 
 def trained(scene: Scene, formation: str) -> Trainer:
     config = run_config(iterations=400, method="hqgs", leave_out="none", formation=formation)
-    trainer = Trainer(scene, config)
-    while trainer.iteration < trainer.length:
-        trainer.step()
-    return trainer
+    return run_until(Trainer(scene, config))
 
 
 def test_ways_are_learned_and_the_scene_gets_sharper() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fixtures_photos import exif, looked_at
 from fixtures_scenes import Truth, make_truth, write_colmap, write_llff, write_photos, write_transforms
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
@@ -15,7 +16,6 @@ from hqgs.photos.pixels import oriented
 from hqgs.scene.load import load_scene
 from hqgs.scene.masks import masks_of
 from hqgs.scene.photo_files import masks_among
-from hqgs.scene.sfm.bare_photos import bare_photos
 
 NAMES = [
     "{stem}.png.mask.png", "{stem}.mask.png", "{stem}-mask.png", "{stem}_mask.png", "mask.{stem}.png",
@@ -60,8 +60,7 @@ def test_every_name_beside_the_photos(tmp_path: Path, pattern: str, kind: str) -
         folder = tmp_path / "images" if "images" in kind else tmp_path
         write_photos(truth, folder)
         put(truth, folder, pattern)
-        photos = bare_photos(tmp_path, 1)
-        assert photos is not None
+        photos = looked_at(tmp_path)
         assert photos.names == truth.names
         assert len(masks_of(tmp_path, photos.folder, photos.names)) == 5
         return
@@ -145,10 +144,9 @@ def scene_turned(root: Path, orientation: int, shown: bool, size: tuple[int, int
     (root / "masks").mkdir()
     thing = np.zeros((height, width), np.uint8)
     thing[4 : height // 2, 6 : width // 4] = 255
-    tags = Image.Exif()
-    tags[0x0112] = orientation
     for name in truth.names:
-        Image.fromarray(np.repeat(thing[..., None] // 2 + 40, 3, -1)).save(root / "images" / name, exif=tags)
+        grey = np.repeat(thing[..., None] // 2 + 40, 3, -1)
+        Image.fromarray(grey).save(root / "images" / name, exif=exif(orientation))
         mask = Image.fromarray(thing)
         if shown:
             mask.getexif()[0x0112] = orientation
@@ -178,10 +176,8 @@ def test_masks_of_photos_that_are_turned(
 
 def test_where_nothing_tells_how_masks_lie_that_is_said(tmp_path: Path) -> None:
     truth = scene_turned(tmp_path, 3, True, (64, 48))
-    tags = Image.Exif()
-    tags[0x0112] = 3
     for name in truth.names:
-        Image.new("RGB", (64, 48), "grey").save(tmp_path / "images" / name, exif=tags)
+        Image.new("RGB", (64, 48), "grey").save(tmp_path / "images" / name, exif=exif(3))
     scene = load_scene(tmp_path, test_every=0)
     assert any("as they are stored, though that is not certain: check them" in note for note in scene.notes)
 
@@ -189,9 +185,7 @@ def test_where_nothing_tells_how_masks_lie_that_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_orientations_are_those_of_pillow(tmp_path: Path, orientation: int) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (6, 9, 3), dtype=np.uint8)
-    tags = Image.Exif()
-    tags[0x0112] = orientation
-    Image.fromarray(pixels).save(tmp_path / "a.png", exif=tags)
+    Image.fromarray(pixels).save(tmp_path / "a.png", exif=exif(orientation))
     with Image.open(tmp_path / "a.png") as photo:
         shown = np.asarray(ImageOps.exif_transpose(photo))
     np.testing.assert_array_equal(oriented(pixels, orientation), shown)
@@ -206,15 +200,17 @@ def test_cameras_of_photos_as_exif_shows_them(tmp_path: Path, orientation: int) 
     truth = make_truth(4)
     write_colmap(truth, tmp_path, images=None)
     (tmp_path / "images").mkdir()
-    tags = Image.Exif()
-    tags[0x0112] = orientation
     back = {6: 8, 8: 6}.get(orientation, orientation)
     for name, photo in zip(truth.names, truth.photos, strict=True):
-        Image.fromarray(oriented(photo, back)).save(tmp_path / "images" / name, exif=tags)
+        Image.fromarray(oriented(photo, back)).save(tmp_path / "images" / name, exif=exif(orientation))
     put(truth, tmp_path / "masks", "{stem}.png")
     scene = load_scene(tmp_path, test_every=0)
     for view, photo in zip(scene.train, truth.photos, strict=True):
         np.testing.assert_array_equal(view.image, photo)
+        assert view.quarter_turns == 0
         assert view.mask is not None
         assert view.mask[:, :24].all()
         assert not view.mask[:, 24:].any()
+    upright = load_scene(write_colmap(truth, tmp_path / "upright"), downscale=2, test_every=0)
+    for view, small in zip(load_scene(tmp_path, downscale=2, test_every=0).train, upright.train, strict=True):
+        np.testing.assert_array_equal(view.image, small.image)

@@ -112,11 +112,6 @@ def test_ssim_is_the_definition_with_zero_padding() -> None:
     assert ssim(render, photo) == pytest.approx(expected, abs=1e-12)
 
 
-def test_ssim_of_identical_images_is_one() -> None:
-    photo = photo_of(12, 20)
-    assert ssim(photo / 255, photo) == pytest.approx(1.0, abs=1e-12)
-
-
 def test_haarpsi_falls_as_the_render_gets_worse() -> None:
     photo = photo_of(48, 33)
     assert haarpsi(photo / 255, photo) == 1.0
@@ -154,15 +149,11 @@ def test_mask_that_leaves_no_pixel_gives_no_value() -> None:
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
     photo = photo_of(378, 504)  # large enough that torch splits its sums
     render = noisy(photo, 0.07)
-    before = torch.get_num_threads()
-    try:
-        results = []
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            results.append(evaluate_view(render, photo))
-            assert torch.get_num_threads() == threads
-    finally:
-        torch.set_num_threads(before)
+    results = []
+    for threads in (1, 2, 5):
+        torch.set_num_threads(threads)
+        results.append(evaluate_view(render, photo))
+        assert torch.get_num_threads() == threads
     assert results[0] == results[1] == results[2]  # bit for bit
     assert results[0].psnr is not None
 

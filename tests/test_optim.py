@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hqgs._rust import get_num_threads, set_num_threads
+from hqgs._rust import set_num_threads
 from hqgs.training.adam import Adam
 
 SHAPES = [(257, 3), (257,), (257, 15, 3), (257, 0, 3), ()]
@@ -48,13 +48,6 @@ def test_50_steps_agree_with_torch(dtype: torch.dtype, tolerance: float, options
         assert sorted(state) == sorted(expected) == ["exp_avg", "exp_avg_sq", "step"]
         for key, atol in (("exp_avg", tolerance / 30), ("exp_avg_sq", 0.0), ("step", 0.0)):
             torch.testing.assert_close(state[key], expected[key], rtol=tolerance, atol=atol)
-
-
-def test_the_first_step_is_the_learning_rate() -> None:
-    param = torch.zeros(3, requires_grad=True)
-    param.grad = torch.tensor([4.0, -0.01, 0.0])
-    Adam([param], lr=0.1).step()
-    torch.testing.assert_close(param.detach(), torch.tensor([-0.1, 0.1, 0.0]))
 
 
 @pytest.mark.parametrize("used", [0, 3, 8, 15])
@@ -132,7 +125,6 @@ def test_closure_and_nan() -> None:
 
 
 def test_same_bits_for_any_number_of_threads() -> None:
-    before = get_num_threads()
     results = []
     for threads in (1, 2, 3):
         set_num_threads(threads)
@@ -142,7 +134,6 @@ def test_same_bits_for_any_number_of_threads() -> None:
             param.grad = scale * param.detach() ** 2
             optimizer.step()
         results.append(param.detach())
-    set_num_threads(before)
     assert torch.equal(results[0], results[1])
     assert torch.equal(results[0], results[2])
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from run_state import run_until
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.model.gaussians import Gaussians
@@ -195,9 +196,8 @@ def test_a_step_decays_what_it_trains_once_for_each_view_as_the_rates_do(
 
 def test_more_iterations_end_better_where_photos_are_few() -> None:
     def at_the_end(iterations: int) -> float:
-        trainer = Trainer(tiny_scene(4), run_config(iterations=iterations, method="hqgs", formation="none"))
-        while trainer.iteration < trainer.length:
-            trainer.step()
+        config = run_config(iterations=iterations, method="hqgs", formation="none")
+        trainer = run_until(Trainer(tiny_scene(4), config))
         trainer.evaluate()
         found = trainer.history[-1]["psnr"]
         assert found is not None

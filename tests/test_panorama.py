@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from fixtures_photos import looked_at
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -25,7 +26,6 @@ from hqgs.scene.geometry import project
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.sfm.align import align, rotation_angles
-from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.folder import write_colmap_folder
 from hqgs.scene.sfm.likely import pairs_of_faces
 
@@ -163,25 +163,21 @@ def test_a_turntable_before_a_graded_backdrop_is_flat(floor: float, suffix: str,
         Image.fromarray(np.rint(grey.clip(0, 255)).astype(np.uint8)).convert("RGB").save(
             tmp_path / f"{k}{suffix}"
         )
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
-    photos = readable(found)
+    photos = looked_at(tmp_path)
     assert not photos.around
     assert len(photos.names) == 12
 
 
 def test_panoramas_by_what_they_show_are_called_so_and_how_to_refuse_it(tmp_path: Path) -> None:
     write_walk(tmp_path, 5, 512)
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
-    photos = readable(found)
+    photos = looked_at(tmp_path)
     assert photos.around
     (said,) = [note for note in photos.notes if "look like panoramas" in note]
     assert said.startswith("5 photos look like panoramas of 360 x 180 degrees")
     for file in tmp_path.iterdir():  # as the note says
         with Image.open(file) as photo:
             photo.crop((0, 0, 512, 255)).save(file)
-    assert not readable(found).around
+    assert not looked_at(tmp_path).around
 
 
 def test_no_seam_where_a_panorama_ends(tmp_path: Path) -> None:
@@ -239,12 +235,6 @@ def test_a_lens_whose_polynomial_turns_back_ends_there() -> None:
     assert limits == pytest.approx([np.sqrt(1 / 0.9)] * 5, abs=0.005)
 
 
-def look(folder: Path) -> bool:
-    photos = bare_photos(folder, 1.0)
-    assert photos is not None
-    return readable(photos).around
-
-
 def save(folder: Path, names: str, size: tuple[int, int] = (80, 40), **more: Any) -> None:
     """Pictures of other shapes or kinds than panoramas have."""
     folder.mkdir(exist_ok=True)
@@ -258,21 +248,21 @@ TAG = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
 
 def test_panoramas_are_told_from_others(tmp_path: Path) -> None:
     write_walk(tmp_path / "untold", 4, 320)
-    assert look(tmp_path / "untold")
+    assert looked_at(tmp_path / "untold").around
     save(tmp_path / "told", "a.jpg b.jpg c.jpg", xmp=TAG)
-    assert look(tmp_path / "told")
+    assert looked_at(tmp_path / "told").around
     save(tmp_path / "wide", "a.png b.png c.png d.png")
-    assert not look(tmp_path / "wide")
+    assert not looked_at(tmp_path / "wide").around
     save(tmp_path / "parts", "a.png b.png c.png", (90, 60))
     save(tmp_path / "parts", "p.jpg", (90, 30), xmp=TAG)  # a sweep by a phone, among photos
-    assert not look(tmp_path / "parts")
+    assert not looked_at(tmp_path / "parts").around
     write_walk(tmp_path / "circles", 4, 320)  # two fisheye circles side by side
     y, x = np.indices((160, 320)) + 0.5
     dark = np.hypot(x % 160 - 80, y - 80) > 78
     for path in (tmp_path / "circles").iterdir():
         pixels = np.where(dark[..., None], 0, np.asarray(Image.open(path))).astype(np.uint8)
         Image.fromarray(pixels).save(path)
-    assert not look(tmp_path / "circles")
+    assert not looked_at(tmp_path / "circles").around
 
 
 @pytest.mark.parametrize(
@@ -284,9 +274,7 @@ def test_the_kind_that_has_more_photos_is_used(
 ) -> None:
     write_walk(tmp_path, panoramas, 320)
     save(tmp_path, flat, (64, 48))
-    found = bare_photos(tmp_path, 1.0)
-    assert found is not None
-    photos = readable(found)
+    photos = looked_at(tmp_path)
     assert photos.around == (panoramas > 1)
     assert len(photos.names) == max(panoramas, len(flat.split())) == len(photos.sizes) == len(photos.exif)
     assert any(note.startswith(left_out) for note in photos.notes)
@@ -295,10 +283,10 @@ def test_the_kind_that_has_more_photos_is_used(
 def test_what_is_no_walk_of_panoramas_is_refused_by_name(tmp_path: Path) -> None:
     save(tmp_path / "one", "hall.jpg", xmp=TAG)
     with pytest.raises(ValueError, match=r"1 panorama of 360 x 180 degrees \(hall\.jpg\) show.* at least 3"):
-        look(tmp_path / "one")
+        looked_at(tmp_path / "one")
     save(tmp_path / "parts", "a.jpg b.jpg", (90, 30), xmp=TAG)
     with pytest.raises(ValueError, match=r"2 of 2 photos are tagged .* \(a\.jpg: 90 x 30 px\)"):
-        look(tmp_path / "parts")
+        looked_at(tmp_path / "parts")
 
 
 def test_faces_of_one_photo_are_no_pair() -> None:

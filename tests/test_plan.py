@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from planned import planned, repeated
+from run_state import run_until
 from test_diagnose import degraded_scene
 from test_learned_cameras import textured_scene
 from tiny_scene import tiny_config, tiny_scene
@@ -151,8 +152,7 @@ def test_what_is_decided_later_is_added_and_a_resumed_run_reads_the_same(tmp_pat
     config = tiny_config(30, turn=(20, 26))
     trainer = Trainer(tiny_scene(), config)
     before = trainer.plan
-    while trainer.iteration < 22:
-        trainer.step()
+    run_until(trainer, 22)
     assert trainer.plan is before
     assert [(row.what, row.value, row.iteration) for row in trainer.state.rows] == [
         ("length", "26 iterations", 20)
@@ -172,7 +172,7 @@ def test_a_run_of_seconds_resumes_by_the_same_call(tmp_path: Path, monkeypatch: 
 
     def goes_on(to: int) -> Trainer:
         with open_run(tiny_scene(), config, tmp_path, resume=True) as trainer:
-            while trainer.iteration < min(to, trainer.length):
+            while trainer.iteration < min(to, trainer.length):  # which may change
                 trainer.step()
             trainer.save(tmp_path / CHECKPOINT)
         return trainer

@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
+from reference import rotation_matrices
 from scenes import GaussianScene, random_scene
 from torch import Tensor
 
@@ -155,18 +156,6 @@ def test_an_invisible_gaussian_changes_no_bit(
         assert name not in GAUSSIANS or not after[name][at].any(), name
 
 
-def _rotation(q: Tensor) -> Tensor:
-    w, x, y, z = (q / q.norm()).tolist()
-    return torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=F64,
-    )
-
-
 def _product(a: Tensor, b: Tensor) -> Tensor:
     """The quaternion a [4] times each b [N, 4]."""
     w, v = b[:, :1], b[:, 1:]
@@ -182,7 +171,7 @@ def test_moving_world_and_cameras_together_changes_only_the_rounding(
 ) -> None:
     generator = torch.Generator().manual_seed(seed)
     q = torch.randn(4, generator=generator, dtype=F64)
-    R, t = _rotation(q), torch.randn(3, generator=generator, dtype=F64)
+    R, t = rotation_matrices(q[None])[0], torch.randn(3, generator=generator, dtype=F64)
     back = torch.eye(4, dtype=F64)
     back[:3, :3], back[:3, 3] = R.T, -R.T @ t
     moved = replace(
@@ -239,51 +228,6 @@ def test_the_unit_of_the_world_does_not_matter(
         after = picture(_scaled(scene, factor), near_plane=near * factor, far_plane=far * factor, **options)
         for a, b in zip(before, after, strict=True):
             torch.testing.assert_close(a, b, rtol=0.0, atol=1e-8)
-
-
-@st.composite
-def smooth_scenes(draw: DrawFn) -> GaussianScene:
-    """Gaussians larger than the image and not opaque, so that no cutoff is near any pixel."""
-    scene = random_scene(
-        n=draw(st.integers(1, 5)), width=6, height=5, seed=draw(st.integers(0, 2**32 - 1)), hidden=0.0
-    )
-    generator = torch.Generator().manual_seed(draw(st.integers(0, 1000)))
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(shape, generator=generator, dtype=F64)
-
-    n = len(scene.means)
-    depth = uniform(1.0, 6.0, n)
-    K, viewmat = scene.Ks[0], scene.viewmats[0]
-    pixels = torch.stack([uniform(0.0, 6.0, n), uniform(0.0, 5.0, n), torch.ones(n, dtype=F64)], dim=1)
-    in_camera = (pixels @ torch.linalg.inv(K).T) * depth[:, None]
-    return replace(
-        scene,
-        means=(in_camera - viewmat[:3, 3]) @ viewmat[:3, :3],
-        scales=uniform(1.0, 2.0, n, 3) * (6.0 * depth / K[0, 0])[:, None],
-        opacities=uniform(0.2, 0.8, n),
-    )
-
-
-@always_the_same
-@given(smooth_scenes(), st.sampled_from(["classic", "antialiased"]), st.integers(0, 1000))
-def test_the_gradient_is_the_limit_of_differences(scene: GaussianScene, mode: str, seed: int) -> None:
-    options = {"rasterize_mode": mode}
-    generator = torch.Generator().manual_seed(seed)
-    found = gradients(scene, **options)
-    step = 1e-5
-    for name in INPUTS:
-        value = getattr(scene, name)
-        direction = torch.randn(value.shape, generator=generator, dtype=F64)
-        if name == "viewmats":
-            direction[:, 3] = 0.0  # the last row is fixed
-        ahead, behind = (
-            _weighted(*picture(replace(scene, **{name: value + sign * step * direction}), **options))
-            for sign in (1, -1)
-        )
-        expected = float(ahead - behind) / (2 * step)
-        scale = float(found[name].norm() * direction.norm()) + 1e-3
-        assert abs(float((found[name] * direction).sum()) - expected) < 1e-6 * scale, name
 
 
 @settings(always_the_same, max_examples=150)

@@ -20,7 +20,7 @@ import torch
 from example_method import Tinted, install
 from forks import forks
 from planned import schedule_of
-from run_state import State, assert_same, read_state
+from run_state import assert_same, read_state, run_until
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
@@ -43,11 +43,6 @@ CASES: dict[str, dict[str, Any]] = {
     "tinted": {"method": "tinted"},  # a tensor of its own, and harmonics of which all is sent
     "hqgs": {"method": "hqgs", "hqgs": hqgs.TrainConfig().hqgs.__class__(formation="exposure")},
 }
-
-
-def state_of(path: Path) -> State:
-    """A checkpoint without what measures time."""
-    return read_state(path)
 
 
 def config_of(case: str, batch: int = 4) -> TrainConfig:
@@ -91,7 +86,7 @@ def work(out: str, what: str) -> None:
     install(monkeypatch, "tinted", lambda *given: Tinted())
     names, _, fault = what.partition(":")
     module.PIECE = 20_000  # the longest messages have several
-    if fault in ("silent", "bad"):
+    if fault == "bad":
         module.HEARTBEAT = 0.5
     with joined() as ranks:
         for case in names.split(","):
@@ -125,9 +120,9 @@ def test_same_bits_for_any_number_of_processes_and_threads(count: int, alone: Pa
     for code, said in ended(started(count, tmp_path, ",".join(CASES))):
         assert code == 0, said
     for case in CASES:
-        expected = state_of(alone / case / "1" / CHECKPOINT)
+        expected = read_state(alone / case / "1" / CHECKPOINT)
         for folder in (alone / case / "2", tmp_path / case / "2"):
-            assert_same(state_of(folder / CHECKPOINT), expected)
+            assert_same(read_state(folder / CHECKPOINT), expected)
             assert (folder / PLY).read_bytes() == (alone / case / "1" / PLY).read_bytes()
 
 
@@ -140,9 +135,9 @@ def test_a_killed_rank_ends_the_others_and_another_number_goes_on(alone: Path, t
     assert time.perf_counter() - began < 60
     folder = tmp_path / "3dgs" / "2"
     assert not (folder / PLY).exists()
-    assert 0 < state_of(folder / CHECKPOINT)[1]["iteration"] < 40  # type: ignore[operator]
+    assert 0 < read_state(folder / CHECKPOINT)[1]["iteration"] < 40  # type: ignore[operator]
     work(str(tmp_path), "3dgs")
-    assert_same(state_of(folder / CHECKPOINT), state_of(alone / "3dgs" / "1" / CHECKPOINT))
+    assert_same(read_state(folder / CHECKPOINT), read_state(alone / "3dgs" / "1" / CHECKPOINT))
     assert (folder / PLY).read_bytes() == (alone / "3dgs" / "1" / PLY).read_bytes()
 
 
@@ -186,9 +181,7 @@ def test_torchrun_must_have_set_all_that_it_sets(monkeypatch: pytest.MonkeyPatch
 
 def test_gradients_are_those_of_the_mean_of_the_losses() -> None:
     scene, config = tiny_scene(), config_of("3dgs")
-    trainer = Trainer(scene, config)
-    for _ in range(6):
-        trainer.step()
+    trainer = run_until(Trainer(scene, config), 6)
     gaussians, optimizer = trainer.gaussians, trainer.state.optimizer
     plans = trainer.schedule.batch(26, trainer.state.decisions)
     assert len(plans) == 4

@@ -6,6 +6,7 @@ import inspect
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from scenes import random_scene
@@ -53,6 +54,7 @@ def test_signature_is_that_of_gsplat() -> None:
         ("with_ut", True),
         ("with_eval3d", True),
         ("radial_coeffs", torch.zeros(1, 4)),
+        ("radial_coeffs", np.zeros((1, 4))),
         ("tangential_coeffs", torch.zeros(1, 2)),
         ("thin_prism_coeffs", torch.zeros(1, 4)),
         ("ftheta_coeffs", object()),
@@ -66,6 +68,29 @@ def test_unsupported_arguments_say_so(name: str, value: object) -> None:
     scene = random_scene(8, 10, 7, seed=0, dtype=F32)
     with pytest.raises(NotImplementedError, match=name):
         hqgs.rasterization(**scene.arguments(**{name: value}))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"viewmats": np.eye(4)[None], "backgrounds": torch.ones(1, 3)}, "viewmats: expected a torch tensor"),
+        ({"means": [[0, 0, 0]], "covars": torch.eye(3)[None]}, "means: expected a torch tensor"),
+        ({"tile_size": 0}, "tile_size: must be an integer of at least 1, got 0"),
+        ({"eps2d": None}, "eps2d: must be finite and not negative, got None"),
+        ({"near_plane": "a"}, "near_plane: must be finite and not negative, got 'a'"),
+        ({"width": float("nan")}, "width: must be an integer of at least 1, got nan"),
+        ({"height": None}, "height: must be an integer of at least 1, got None"),
+        (
+            {"width": 2**19, "height": 2**19},
+            "width, height: at most 4,294,967,296 pixels, got 274,877,906,944",
+        ),
+        ({"colors": (1, 2, 3)}, "colors: expected a torch tensor"),
+    ],
+)
+def test_arguments_are_named(given: dict[str, Any], words: str) -> None:
+    scene = random_scene(1, 8, 8, seed=0, dtype=F32)
+    with pytest.raises(ValueError, match=words):
+        hqgs.rasterization(**scene.arguments(**given))
 
 
 def test_unsupported_arguments_may_be_passed_as_absent() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -144,15 +144,7 @@ def random_cotangents(scene: GaussianScene, **options: Any) -> tuple[Tensor, Ten
     return cotangents_for(scene, everywhere, **options)
 
 
-@pytest.fixture
-def restore_threads() -> Iterator[None]:
-    before = hqgs.get_num_threads()
-    yield
-    hqgs.set_num_threads(before)
-
-
 @both_dtypes
-@pytest.mark.usefixtures("restore_threads")
 def test_any_number_of_threads_gives_the_same_bits(dtype: torch.dtype) -> None:
     scene = random_scene(3000, 150, 110, cameras=2, seed=9, dtype=dtype, sh_degree=2)
     cotangents = random_cotangents(scene, render_mode="RGB+ED")

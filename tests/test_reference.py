@@ -11,7 +11,6 @@ import torch
 from numpy.polynomial import legendre
 from reference import reference_rasterization, rotation_matrices, sh_basis, sh_colors
 from scenes import GaussianScene, random_scene
-from torch import Tensor
 
 F64 = torch.float64
 TWO = [[0.0, 0.0, 4.0], [0.0, 0.0, 2.0]]  # index 1 is in front
@@ -202,18 +201,6 @@ def test_sh_basis_is_the_real_sh() -> None:
     np.testing.assert_allclose(sh_basis(torch.tensor(dirs)).numpy(), expected, atol=1e-13)
 
 
-def test_sh_basis_is_orthonormal() -> None:
-    """Gauss-Legendre in cos(theta) and equal steps in phi integrate degree 6 on the sphere exactly."""
-    nodes, weights = legendre.leggauss(8)
-    phi = np.arange(16) * (2 * np.pi / 16)
-    z = np.repeat(nodes, 16)
-    ring = np.sqrt(1 - z**2)
-    dirs = np.stack([ring * np.cos(np.tile(phi, 8)), ring * np.sin(np.tile(phi, 8)), z], axis=1)
-    basis = sh_basis(torch.tensor(dirs)).numpy()
-    gram = basis.T @ (basis * np.repeat(weights, 16)[:, None] * (2 * np.pi / 16))
-    np.testing.assert_allclose(gram, np.eye(16), atol=1e-13)
-
-
 def test_sh_direction_runs_from_the_camera_to_the_gaussian() -> None:
     """A Gaussian along world x from the camera sees -x of degree 1; one on the camera only degree 0."""
     R = rotation_matrices(torch.tensor([[0.3, -0.5, 0.7, 0.2]], dtype=F64))[0]
@@ -231,43 +218,6 @@ def test_sh_direction_runs_from_the_camera_to_the_gaussian() -> None:
     colors.sum().backward()
     assert means.grad is not None
     assert means.grad[1].tolist() == [0.0, 0.0, 0.0]
-
-
-def test_rigid_motion_of_the_world_changes_nothing() -> None:
-    scene = random_scene(60, 31, 23, cameras=2, seed=5)
-    motion_quat = torch.tensor([0.4, -0.8, 0.3, 0.6], dtype=F64)
-    Q = rotation_matrices(motion_quat[None])[0]
-    shift = torch.tensor([3.0, -7.0, 2.0], dtype=F64)
-    w, v = motion_quat[0], motion_quat[1:]
-    sw, sv = scene.quats[:, :1], scene.quats[:, 1:]
-    product = torch.cat(
-        [w * sw - (sv * v).sum(1, keepdim=True), w * sv + sw * v + torch.linalg.cross(v.expand_as(sv), sv)],
-        dim=1,
-    )
-    back = torch.eye(4, dtype=F64)
-    back[:3, :3], back[:3, 3] = Q.T, -Q.T @ shift
-    moved = replace(scene, means=scene.means @ Q.T + shift, quats=product, viewmats=scene.viewmats @ back)
-    a, alpha_a, meta = reference_rasterization(**scene.arguments(), render_mode="RGB+D")
-    b, alpha_b, _ = reference_rasterization(**moved.arguments(), render_mode="RGB+D")
-    safe = (meta["min_margin"] > 1e-9)[..., None]
-    assert safe.double().mean() > 0.99
-    assert ((a - b).abs() * safe).max() < 1e-10
-    assert ((alpha_a - alpha_b).abs() * safe).max() < 1e-10
-
-
-@pytest.mark.parametrize(("sh_degree", "mode"), [(None, "classic"), (2, "antialiased")])
-def test_gradcheck(sh_degree: int | None, mode: str) -> None:
-    """The decisions are detached: away from the jumps that changes no derivative."""
-    scene = random_scene(4, 5, 4, seed=8, sh_degree=sh_degree, hidden=0.0).with_grad(*INPUTS)
-    meta = reference_rasterization(**scene.arguments(), rasterize_mode=mode)[2]
-    assert min(meta[name].min() for name in ("min_margin", "cap_margin")) > 1e-4
-    assert (meta["radii"] > 0).any(-1).sum() >= 3
-
-    def render(*tensors: Tensor) -> tuple[Tensor, Tensor]:
-        moved = replace(scene, **dict(zip(INPUTS, tensors, strict=True)))
-        return reference_rasterization(**moved.arguments(), render_mode="RGB+ED", rasterize_mode=mode)[:2]
-
-    assert torch.autograd.gradcheck(render, tuple(getattr(scene, name) for name in INPUTS), fast_mode=True)
 
 
 def test_culled_gaussians_have_no_say() -> None:
@@ -290,18 +240,3 @@ def test_culled_gaussians_have_no_say() -> None:
         grad = getattr(broken, name).grad
         assert torch.isfinite(grad).all()
         assert (grad[:5] == 0).all()
-
-
-def test_absgrad_is_the_sum_of_absolute_pixel_gradients() -> None:
-    scene = random_scene(6, 7, 5, seed=1, hidden=0.0).with_grad("means")
-    cotangent = torch.randn(1, 5, 7, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
-    render, _, meta = reference_rasterization(**scene.arguments(), absgrad=True)
-    (render * cotangent).sum().backward()
-    render, _, plain = reference_rasterization(**scene.arguments())
-    expected = torch.zeros(1, 6, 2, dtype=F64)
-    for i in range(5):
-        for j in range(7):
-            value = (render[0, i, j] * cotangent[0, i, j]).sum()
-            expected += torch.autograd.grad(value, plain["means2d"], retain_graph=True)[0].abs()
-    assert expected.abs().max() > 0
-    torch.testing.assert_close(meta["means2d"].absgrad, expected, rtol=1e-12, atol=1e-14)

@@ -10,62 +10,17 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from fixtures_cards import CARDS, HEIGHT, WIDTH
 from PIL import Image
-from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 import hqgs
 from hqgs.base.stages import Stage
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.load import load_scene
-from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.scene import Scene, View
 from hqgs.scene.sfm import run as colmap_run
 from hqgs.scene.sfm.reconstruct import sfm_scene
-
-WIDTH, HEIGHT = 192, 144
-CARDS = [
-    (5.0, -9, 9, -9, 9),
-    (3.6, -1.4, -0.2, -1, 0.3),
-    (3.0, 0.1, 1.2, -0.3, 0.8),
-]  # z, x from, to, y from, to
-
-
-def photo_of(camera: Camera) -> np.ndarray:
-    """The cards [HEIGHT, WIDTH, 3] uint8, nearest in front, each with a fixed blotchy texture."""
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    rays = np.linalg.solve(camera.K, np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)]))
-    directions = (camera.viewmat[:3, :3].T @ rays).T
-    image = np.zeros((rows.size, 3))
-    for k, (z, left, right, top, bottom) in enumerate(CARDS):
-        hit = camera.center + directions * ((z - camera.center[2]) / directions[:, 2])[:, None]
-        inside = (left < hit[:, 0]) & (hit[:, 0] < right) & (top < hit[:, 1]) & (hit[:, 1] < bottom)
-        rng = np.random.default_rng(k)
-        layers = [ndimage.gaussian_filter(rng.random((420, 420, 3)), (s, s, 0)) for s in (1.8, 4.5)]
-        texture = np.sum([(layer - 0.5) / layer.std() for layer in layers], axis=0) * 0.14 + 0.5
-        at = np.stack([hit[:, 1], hit[:, 0]]) * 60 + 210
-        colors = np.stack(
-            [ndimage.map_coordinates(texture[..., c], at, order=1, mode="wrap") for c in range(3)], -1
-        )
-        image[inside] = colors[inside]
-    return np.rint(image.clip(0, 1) * 255).astype(np.uint8).reshape(HEIGHT, WIDTH, 3)
-
-
-@pytest.fixture(scope="module")
-def cards() -> Scene:
-    """9 photos; the held-out ones are the first and the last."""
-    rng = np.random.default_rng(5)
-    K = np.array([[184.0, 0, WIDTH / 2], [0, 184, HEIGHT / 2], [0, 0, 1]])
-    views = []
-    for k in range(9):
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = Rotation.from_rotvec(0.04 * rng.standard_normal(3)).as_matrix()
-        center = np.array([k % 3 - 1, k // 3 - 1, 0]) * [0.5, 0.35, 0] + 0.05 * rng.standard_normal(3)
-        viewmat[:3, 3] = -viewmat[:3, :3] @ center
-        camera = Camera(WIDTH, HEIGHT, K, viewmat)
-        views.append(View(f"photo {k}.jpg", camera, photo_of(camera)))
-    points = rng.uniform([-2, -1.5, 5], [2, 1.5, 5], (500, 3)).astype(np.float32)
-    return Scene("cards", views[1:-1], [views[0], views[-1]], points, np.zeros((500, 3), np.uint8), "test")
 
 
 @pytest.fixture(scope="module")
@@ -146,11 +101,8 @@ def test_the_report_says_how_far_they_are_off(cards: Scene, found: Scene) -> Non
 def test_no_thread_and_no_held_out_view_changes_a_bit(cards: Scene, found: Scene) -> None:
     black = [replace(view, image=np.zeros_like(view.image)) for view in cards.test]
     threads = hqgs.get_num_threads()
-    try:
-        hqgs.set_num_threads(3 if threads < 3 else 1)
-        again = sfm_scene(replace(cards, test=black))
-    finally:
-        hqgs.set_num_threads(threads)
+    hqgs.set_num_threads(3 if threads < 3 else 1)
+    again = sfm_scene(replace(cards, test=black))
     assert again.points.tobytes() == found.points.tobytes()
     for a, b in zip(again.train, found.train, strict=True):
         assert a.camera.viewmat.tobytes() == b.camera.viewmat.tobytes()
@@ -159,13 +111,10 @@ def test_no_thread_and_no_held_out_view_changes_a_bit(cards: Scene, found: Scene
 def test_smoothed_photos_and_patches_place_noisy_ones_on_any_threads(cards: Scene) -> None:
     """Without them 6 of the 7 or fewer have a place."""
     noisy = degrade_scene(cards, parse_degradation("noise:50"), 0)
-    threads, stages, found = hqgs.get_num_threads(), set[str](), []
-    try:
-        for count in (1, 3):
-            hqgs.set_num_threads(count)
-            found.append(sfm_scene(noisy, on_stage=lambda stage: stages.add(stage.what)))
-    finally:
-        hqgs.set_num_threads(threads)
+    stages, found = set[str](), []
+    for count in (1, 3):
+        hqgs.set_num_threads(count)
+        found.append(sfm_scene(noisy, on_stage=lambda stage: stages.add(stage.what)))
     assert any(what.endswith("with smoothed photos") for what in stages)
     assert len(found[0].train) == 7
     assert found[0].sfm is not None

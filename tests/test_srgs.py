@@ -10,6 +10,7 @@ import pytest
 import torch
 from example_method import install, loss_of
 from numpy.typing import NDArray
+from run_state import run_until
 from scipy.ndimage import correlate1d
 from tiny_scene import tiny_config, tiny_scene
 
@@ -187,9 +188,9 @@ def test_photos_come_out_sharper_than_those_of_3dgs(monkeypatch: pytest.MonkeyPa
     scene, clean = fine_scene()
     values = {}
     for method in ("3dgs", "srgs"):
-        trainer = Trainer(scene, tiny_config(300, method=method, densify=DensifyConfig(stop=0)))
-        for _ in range(300):
-            trainer.step()
+        trainer = run_until(
+            Trainer(scene, tiny_config(300, method=method, densify=DensifyConfig(stop=0))), 300
+        )
         trainer.prepared.given = replace(scene, test=scene.train)
         renders = [view.render for view in list(trainer.held_out())]
         values[method] = np.mean([psnr(r, c) or 0 for r, c in zip(renders, clean, strict=True)])

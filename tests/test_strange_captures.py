@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fixtures_photos import looked_at
 from fixtures_scenes import make_truth
 from PIL import Image
 from test_film import encoded
-from test_front_door import looked_at
 from test_georeference import EAST, METRES, NORTH
-from test_sfm import cards  # noqa: F401
 from test_synthetic import depth_error, views_of
 
 from hqgs.photos.exif import Exif, read_exif
@@ -32,7 +31,7 @@ from hqgs.scene.sfm.run import Model
 from hqgs.scene.sfm.triangulated import SparsePoints, triangulated
 
 
-def test_names_with_blanks_find_their_pairs(cards: Scene, tmp_path: Path) -> None:  # noqa: F811
+def test_names_with_blanks_find_their_pairs(cards: Scene, tmp_path: Path) -> None:
     """As frames of a film, whose pairs are listed; the photos keep their names."""
     names = []
     for k, view in enumerate(sorted([*cards.train, *cards.test], key=lambda view: view.name)):
@@ -68,7 +67,7 @@ def test_numbered_photos_are_no_copies(tmp_path: Path) -> None:
     assert looked_at(tmp_path).names == ["vase.png"]
 
 
-def test_grey_photos_of_16_bits_are_seen(cards: Scene, tmp_path: Path) -> None:  # noqa: F811
+def test_grey_photos_of_16_bits_are_seen(cards: Scene, tmp_path: Path) -> None:
     for k, view in enumerate(sorted([*cards.train, *cards.test], key=lambda view: view.name)):
         levels = view.image.astype(np.float64).mean(2)
         Image.fromarray((257 * levels).astype(np.uint16)).save(tmp_path / f"{k}.png")
@@ -82,7 +81,7 @@ def test_grey_photos_of_16_bits_are_seen(cards: Scene, tmp_path: Path) -> None: 
         glance(tmp_path / "x.tif")
 
 
-def test_links_to_photos_that_were_moved_are_made_anew(cards: Scene, tmp_path: Path) -> None:  # noqa: F811
+def test_links_to_photos_that_were_moved_are_made_anew(cards: Scene, tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     for k, view in enumerate([*cards.train, *cards.test]):
         Image.fromarray(view.image.astype(np.uint8)).save(tmp_path / "photos" / f"{k}.png")

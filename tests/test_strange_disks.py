@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures_photos import looked_at
 from fixtures_scenes import Truth, make_truth, write_colmap, write_llff, write_photos, write_transforms
 from PIL import Image
 
@@ -22,7 +23,6 @@ from hqgs.base.files import atomic_path, keep_folder, lock_folder, write_json, w
 from hqgs.scene.load import load_scene
 from hqgs.scene.photo_files import below
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.bare_photos import bare_photos, readable
 
 LATIN = "caf\udce9 1.png"  # é in the code of an older Windows, as Python reads it from the disk
 
@@ -65,9 +65,7 @@ def test_photos_alone_of_another_code_are_used(tmp_path: Path) -> None:
     truth = make_truth(5)
     write_photos(truth, tmp_path)
     os.rename(tmp_path / truth.names[0], tmp_path / LATIN)
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
-    photos = readable(found)
+    photos = looked_at(tmp_path)
     assert LATIN in photos.names
     assert not photos.unreadable
     for name in photos.colmap_names:
@@ -122,8 +120,7 @@ def test_photos_alone_behind_links_count_once(tmp_path: Path) -> None:
     (root / "a").symlink_to(tmp_path / "card" / "walk")
     (root / "b").symlink_to(tmp_path / "card" / "walk")
     (tmp_path / "card" / "walk" / "back").symlink_to(root)
-    found = bare_photos(root, 1)
-    assert found is not None
+    found = looked_at(root)
     assert found.names == truth.names
     assert not any("copies" in note or "not used" in note for note in found.notes)
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from test_film import encoded
 
 from hqgs.photos.film_colors import as_photo
 from hqgs.photos.video import pyav
@@ -182,13 +183,6 @@ def test_wide_primaries_become_srgb(primaries: int, stored: tuple[int, int, int]
 
 
 def test_pixels_of_a_camera_are_squares_and_upright_at_once(tmp_path: Path) -> None:
-    images = pictures(8)
-    with av.open(str(tmp_path / "a.mp4"), "w") as film:
-        stream = film.add_stream("libx264", rate=25)
-        stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "yuv420p"
-        stream.codec_context.sample_aspect_ratio = Fraction(3, 2)
-        for image in images:
-            film.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        film.mux(stream.encode())
-    frames, _ = frames_of(turned(tmp_path / "a.mp4", (0, 1, -1, 0)), tmp_path)
+    path = encoded(tmp_path / "a.mp4", pictures(8), 10, wide=Fraction(3, 2))
+    frames, _ = frames_of(turned(path, (0, 1, -1, 0)), tmp_path)
     assert frames[0].shape == (192, HEIGHT, 3)

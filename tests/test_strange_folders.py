@@ -6,20 +6,13 @@ import shutil
 from pathlib import Path
 
 import pytest
+from fixtures_photos import looked_at, picture
 from PIL import Image, features
-from test_bare_photos import picture
 
 from hqgs.photos.files import LARGEST, UnreadableError, decode, glance
 from hqgs.scene.film import check_film
 from hqgs.scene.names import existing_folder
 from hqgs.scene.photo_files import film_at
-from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
-
-
-def looked_at(folder: Path) -> BarePhotos:
-    found = bare_photos(folder, 1)
-    assert found is not None
-    return readable(found)
 
 
 def pictures(folder: Path, count: int = 3, first: int = 0, suffix: str = ".png") -> None:

@@ -16,7 +16,6 @@ from example_method import Tinted, install
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
-import hqgs
 from benchmarks.scenes.room.scene import embedded_scene
 from hqgs.base.files import CHECKPOINT, PLY
 from hqgs.base.interrupt import ENDINGS
@@ -24,7 +23,6 @@ from hqgs.evaluation import held_out
 from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import open_run, run_to_end, train
 from hqgs.scene.scene import Scene, View
-from hqgs.training import forward
 from hqgs.training.config import DensifyConfig, TrainConfig, check_method
 from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW
 from hqgs.training.methods.base import Target, ThreeDGS, photo_tensors
@@ -133,20 +131,6 @@ def test_the_learning_rates_of_3dgs() -> None:
     assert rest == {"scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 
 
-def test_the_sh_degree_rises_by_one_per_interval(monkeypatch: pytest.MonkeyPatch) -> None:
-    degrees = []
-    real = forward.render_view
-
-    def spy(gaussians: Gaussians, camera: Any, sh_degree: int, *more: Any) -> Any:
-        degrees.append(sh_degree)
-        return real(gaussians, camera, sh_degree, *more)
-
-    monkeypatch.setattr(forward, "render_view", spy)
-    trainer = Trainer(tiny_scene(), tiny_config(sh_interval=4, sh_degree=2, densify=ONLY_TRAIN))
-    steps(trainer, 14)
-    assert degrees == [0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 2, 2, 2]
-
-
 def test_evaluation_takes_no_training_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def slow_ssim(*images: Any) -> float:
         time.sleep(0.3)
@@ -160,24 +144,6 @@ def test_evaluation_takes_no_training_time(monkeypatch: pytest.MonkeyPatch, tmp_
     trainer.evaluate()  # once per iteration
     assert trainer.seconds == before
     assert [entry["seconds"] for entry in trainer.history] == [before]
-
-
-def test_the_number_of_threads_changes_no_bit() -> None:
-    found = []
-    before = hqgs.get_num_threads(), torch.get_num_threads()
-    try:
-        for rasterizer, torch_threads in ((1, 1), (2, 2), (3, 1)):
-            hqgs.set_num_threads(rasterizer)
-            torch.set_num_threads(torch_threads)
-            trainer = Trainer(tiny_scene(num_points=300), tiny_config())
-            steps(trainer, 30)
-            found.append(bits(trainer))
-            assert torch.get_num_threads() == torch_threads
-    finally:
-        hqgs.set_num_threads(before[0])
-        torch.set_num_threads(before[1])
-    assert len(trainer.gaussians) > 300
-    assert found[0] == found[1] == found[2]
 
 
 def test_seeds_matter() -> None:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from run_state import run_until
 from tiny_scene import tiny_scene
 
 from hqgs.base.files import CHECKPOINT
@@ -178,8 +179,7 @@ def test_a_resumed_run_learns_the_looks_that_paid(tmp_path: Path, monkeypatch: p
         trainer = Trainer(scene, replace(config, iterations=iterations), tries=not file.exists())
         if file.exists():
             trainer.restore(file)
-        while trainer.iteration < trainer.length:
-            trainer.step()
+        run_until(trainer)
         assert {group["name"] for group in trainer.method.param_groups()} == {"gains"}
         trainer.save(file)
     assert (trainer.iteration, len(tries)) == (4, 1)
@@ -220,8 +220,7 @@ def test_a_resumed_run_goes_by_the_trial_that_was(tmp_path: Path, monkeypatch: p
         trainer = Trainer(scene, replace(config, iterations=iterations), tries=not going_on)
         if going_on:
             trainer.restore(file)
-        while trainer.iteration < trainer.length:
-            trainer.step()
+        run_until(trainer)
         assert "validation photos" in told(trainer.plan)
         trainer.save(file)
     assert (trainer.iteration, len(trials)) == (4, 1)

@@ -165,11 +165,6 @@ def test_strangers_huge_messages_and_paths_are_refused(capsys: pytest.CaptureFix
         server.stop()
 
 
-def test_the_port_is_checked() -> None:
-    with pytest.raises(ValueError, match=r"port is 70000, wanted 0\.\.65535"):
-        start_server(port=70000)
-
-
 # --- the pictures
 
 
@@ -376,7 +371,7 @@ def test_view_ends_by_itself_and_says_where_to_look(
 ) -> None:
     assert view.run(view.ViewOptions(source=folder, port=0), seconds=0.1) == 0
     assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler  # pycolmap's prints a stack trace
-    assert "look at http://127.0.0.1:" in capsys.readouterr().out
+    assert "open http://127.0.0.1:" in capsys.readouterr().out
     bare = tmp_path / "a b" / "bare.ply"
     hqgs.Gaussians.load(folder).save(bare)
 
@@ -420,7 +415,7 @@ def test_train_shows_its_page_and_stays(
     command = ["train", "embedded", "--out", str(tmp_path), "--iterations", "3", "--view", "--port", "0"]
     assert cli.main(command) == 0
     told = capsys.readouterr().out
-    assert told.count("look at http://127.0.0.1:") == 2
+    assert told.count("open http://127.0.0.1:") == 2
     assert "next, to see it" not in told
     assert cli.main([*command, "--resume"]) == 0  # without a step
     assert shown == [True, True]

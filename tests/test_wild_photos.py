@@ -386,41 +386,6 @@ def test_steps_before_and_after_a_film() -> None:
 # --- text
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["shake", "shake:7.5", "exposure:0.5", "chat:640", "phone", "phone:3", "video:23", "video265",
-     "some:shake", "some:noise:25", "some:blur+jpeg:30", "shake+exposure+video:30"],
-)  # fmt: skip
-def test_text_comes_back(text: str) -> None:
-    assert str(parse_degradation(text)) == text
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("shake:0.1", "shake is 0.1, wanted the longest extent of a shake in px, 0.5..200"),
-        ("exposure:9", "exposure is 9, wanted the largest deviation in stops, 0.01..4"),
-        ("chat:7", "chat is 7, wanted the longest side in px, an integer in 8..10000"),
-        ("phone:-1", "phone is -1, wanted stops of light that are missing, 0..12"),
-        ("video:52", "video is 52, wanted a constant rate factor, an integer in 0..51"),
-        ("video:20.5", "video is 20.5, wanted a constant rate factor, an integer"),
-        ("some", "some takes one of jpeg, noise, blur, .*; got some:$"),
-        ("some:lowres:2", "some takes one of jpeg, noise, blur, .*; got some:lowres"),
-        ("some:video", "got some:video"),
-        ("some:mixed", "got some:mixed"),
-        ("some:fog", "got some:fog"),
-        ("some:noise", "noise needs a value"),
-        ("some:noise:x", "'x' in the degradation 'some:noise:x' is not a number"),
-        ("some:jpeg:0", "jpeg is 0"),
-        ("focus", "focus depends on depths, .*; defocus:R blurs the whole photo"),
-        ("blur+grain", "grain means that each photo has its own noise; some:noise:SIGMA makes such photos"),
-    ],
-)
-def test_bad_text_is_refused(text: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        parse_degradation(text)
-
-
 def test_defaults() -> None:
     text = "+".join(NEW)
     assert str(parse_degradation(text).for_width(504)) == (

@@ -22,7 +22,6 @@ from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.sfm.triangulated import SparsePoints
 
 Floats = NDArray[np.float64]
-ONE = np.array([[0.5, 0.5]])
 
 
 def small_camera(k: int = 3, width: int = 72, height: int = 54) -> Camera:

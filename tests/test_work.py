@@ -218,15 +218,6 @@ def test_only_what_requires_a_gradient_gets_an_array(names: tuple[str, ...], num
         assert (tensor.grad is not None) == (name in names)
 
 
-def test_the_gradient_of_the_harmonics_alone_is_that_of_all() -> None:
-    some, every = scene("colors", sh_degree=2), scene(*ALL, sh_degree=2)
-    for s in (some, every):
-        forward(s)[0].square().sum().backward()
-    assert some.colors.grad is not None
-    assert every.colors.grad is not None
-    assert torch.equal(some.colors.grad, every.colors.grad)
-
-
 @pytest.mark.parametrize("enabled", [False, True])
 def test_nothing_is_kept_without_gradients(enabled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only an image that can be differentiated holds the tile lists and the projection."""
