@@ -1,4 +1,4 @@
-"""The templates of pages, and their charts as SVG text: lines, and the cameras from above."""
+"""The templates of pages, and their charts as SVG text."""
 
 from __future__ import annotations
 
@@ -9,12 +9,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from hqgs.scene.faces import photo_name
-from hqgs.scene.paths import focus, scene_up
-from hqgs.scene.scene import Scene
-
 TEMPLATES = Path(__file__).parent / "templates"
-LOOSE, LOOSER = 0.5, 3.0  # px that a pose may be off, and times the usual: a loose one
 
 
 def filled(template: str, **values: Any) -> Markup:
@@ -62,44 +57,3 @@ def _ticks(low: float, high: float) -> list[float]:
 
 def _number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
-
-
-def places_chart(scene: Scene) -> Markup | None:
-    """The cameras from above, and how sure each one's place is; None of photos of one place."""
-    width, height, border = 640, 420, 24  # px, as the template has them
-    views = [*scene.train, *scene.test]
-    if len(views) < 2:
-        return None
-    up = scene_up(scene)
-    first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    plane = np.stack([first, np.cross(up, first)]) / np.linalg.norm(first)
-    middle = focus([view.camera for view in scene.train])
-    cameras = (np.stack([view.camera.center for view in views]) - middle) @ plane.T
-    points = (scene.points[:: max(1, len(scene.points) // 300)].astype(np.float64) - middle) @ plane.T
-    near = np.linalg.norm(points, axis=1)
-    points = points[near <= np.percentile(near, 90)] if len(points) else points
-    all_of_them = np.concatenate([cameras, points])
-    low, high = all_of_them.min(0), all_of_them.max(0)
-    scale = min(
-        (width - 2 * border) / max(high[0] - low[0], 1e-9),
-        (height - 2 * border) / max(high[1] - low[1], 1e-9),
-    )
-    if not np.isfinite(scale):
-        return None
-    center = (low + high) / 2
-
-    def at(place: np.ndarray) -> tuple[float, float]:
-        x, y = (place - center) * scale + np.array([width, height]) / 2
-        return round(float(x), 1), round(float(y), 1)
-
-    sure = {} if scene.sfm is None else scene.sfm.sure_px
-    most = max(LOOSE, LOOSER * float(np.median([*sure.values()]))) if sure else 0.0
-    shown = []
-    for view, place in zip(views, cameras, strict=True):
-        ahead = plane @ view.camera.viewmat[2, :3]
-        length = float(np.linalg.norm(ahead))
-        ahead = ahead / length * 9 if length > 1e-6 else np.zeros(2)
-        px = sure.get(photo_name(view.name, view.face))
-        words = view.name if px is None else f"{view.name}: exact to {px:.2f} px"
-        shown.append((*at(place), *at(place + ahead / scale), px is not None and px > most, words))
-    return filled("places.svg.j2", points=[*map(at, points)], cameras=shown)

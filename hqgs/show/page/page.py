@@ -28,7 +28,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
-from hqgs.show.page.charts import TEMPLATES, filled, line_chart, places_chart
+from hqgs.show.page.charts import TEMPLATES, filled, line_chart
 from hqgs.show.page.packing import pack_scene
 
 PAIR_SIDE = 720  # px, of a picture
@@ -125,7 +125,6 @@ def page_text(page: Page) -> str:
         left_out=[_left_out(item) for item in report["left_out"] if not _correction(item)],
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],
-        places=places_chart(page.scene),
         sure=_sure(report),
         lost=[*((report.get("sfm") or {}).get("lost") or {}).items()],
         environment=_environment(report),
