@@ -19,7 +19,7 @@ from tiny_scene import tiny_config, tiny_scene
 import hqgs
 from hqgs._rust import EPS2D
 from hqgs.cli.main import main
-from hqgs.evaluation.causes import PARTS, Maps, causes, pixel_maps, shares, shown_by
+from hqgs.evaluation.causes import PARTS, causes, pixel_maps, shares, shown_by
 from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.judge import flat_psnr
@@ -256,7 +256,7 @@ def sorted_error(
     render: np.ndarray, fog: float = 0.0, photos: float = 9.0, noise: float = 0.0
 ) -> dict[str, float]:
     photo = picture().astype(np.float32)
-    maps = Maps(np.full((SIZE, SIZE), fog), np.full((SIZE, SIZE), photos))
+    maps = np.full((SIZE, SIZE), fog), np.full((SIZE, SIZE), photos)
     return shares([causes(RenderedView("a", photo, render.astype(np.float32)), maps, noise)])
 
 
@@ -276,7 +276,7 @@ def test_errors_go_to_their_causes() -> None:
 
 def test_a_fitted_camera_shows_what_the_pose_costs() -> None:
     photo = picture().astype(np.float32)
-    maps = Maps(np.zeros((SIZE, SIZE)), np.full((SIZE, SIZE), 9.0))
+    maps = np.zeros((SIZE, SIZE)), np.full((SIZE, SIZE), 9.0)
     beside = RenderedView("a", photo, np.roll(photo, 1, axis=1))
     right = RenderedView("a", photo, photo + np.float32(0.001))
     found = shares([causes(beside, maps, 0.0, right)])
@@ -297,10 +297,10 @@ def test_fog_and_the_edge_of_the_capture_are_found() -> None:
     made = replace(made, scales=scales, opacities=opacities)
     upper = np.eye(4)
     upper[1, 3] = 3.2  # a camera that is as much higher: y points down
-    maps = pixel_maps(made, camera, shown_by(made, [Camera(SIZE, SIZE, K, upper)] * 3))
-    assert maps.fog[32, 16] > 0.3
-    assert maps.fog[:, 40:].max() < 0.01
-    assert maps.photos[2, 50] == pytest.approx(3, abs=0.1)
-    assert maps.photos[60, 50] == pytest.approx(0, abs=0.1)
+    fog, photos = pixel_maps(made, camera, shown_by(made, [Camera(SIZE, SIZE, K, upper)] * 3))
+    assert fog[32, 16] > 0.3
+    assert fog[:, 40:].max() < 0.01
+    assert photos[2, 50] == pytest.approx(3, abs=0.1)
+    assert photos[60, 50] == pytest.approx(0, abs=0.1)
     many = shown_by(made, [Camera(SIZE, SIZE, K, upper)] * 1000)  # not all of them are asked
     assert float(many.max()) == 1000

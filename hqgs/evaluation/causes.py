@@ -9,7 +9,7 @@ cameras a wrong pose counts as detail. It is a sorting, not a proof: fog before 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,30 +32,7 @@ Floats = NDArray[np.float64]
 PARTS = ("color", "pose", "edge", "fog", "noise", "detail", "broad")
 
 
-@dataclass(frozen=True)
-class Causes:
-    """Parts of a photo's mean squared error (white is 1), in the order of PARTS; their sum is `mse`."""
-
-    mse: float
-    color: float
-    pose: float
-    edge: float
-    fog: float
-    noise: float
-    detail: float
-    broad: float
-    edge_area: float  # share of the pixels that count
-    fog_area: float
-    contrast: float | None  # of the render's fine detail to the photo's, 1 where equal; None: a flat photo
-    levels: Floats  # [ceil(H / PATCH), ceil(W / PATCH)], root mean square error of a patch; NaN: masked
-
-
-@dataclass(frozen=True)
-class Maps:
-    """Of a camera's pixels, [H, W]."""
-
-    fog: Floats  # share of the colour that comes from before the surface
-    photos: Floats  # training photos that show what is seen, weighted as it is blended
+Causes = dict[str, Any]  # of a photo, as `causes` tells it
 
 
 def shown_by(gaussians: Gaussians, cameras: Sequence[Camera]) -> torch.Tensor:
@@ -69,8 +46,9 @@ def shown_by(gaussians: Gaussians, cameras: Sequence[Camera]) -> torch.Tensor:
 
 
 @torch.no_grad()
-def pixel_maps(gaussians: Gaussians, camera: Camera, shown: torch.Tensor) -> Maps:
-    """`shown` [N]: of `shown_by`."""
+def pixel_maps(gaussians: Gaussians, camera: Camera, shown: torch.Tensor) -> tuple[Floats, Floats]:
+    """Of a camera's pixels, [H, W]: the share of the colour that comes from before the surface, and the
+    training photos that show what is seen, weighted as it is blended. `shown` [N]: of `shown_by`."""
     depths, alphas, _ = gaussians.rasterize(camera, gaussians.sh0[:, 0], render_mode="ED")
     pixels, z = project(camera, gaussians.means.double().numpy())
     inside = within(camera, pixels, z)
@@ -82,11 +60,19 @@ def pixel_maps(gaussians: Gaussians, camera: Camera, shown: torch.Tensor) -> Map
     )  # of the depth in its pixel: such a Gaussian hangs before the surface
     channels = torch.stack([hangs.float(), shown], 1).to(gaussians.means.dtype)
     found, solid = gaussians.rasterize(camera, channels)[0][0], alphas[0, ..., 0].clamp(min=1e-6)
-    return Maps(found[..., 0].double().numpy(), (found[..., 1] / solid).double().numpy())
+    return found[..., 0].double().numpy(), (found[..., 1] / solid).double().numpy()
 
 
-def causes(seen: RenderedView, maps: Maps, noise: float, fitted: RenderedView | None = None) -> Causes:
-    """Of one photo. `noise`: the photo's own, its deviation, white is 1; `fitted`: with its camera fitted."""
+def causes(
+    seen: RenderedView, maps: tuple[Floats, Floats], noise: float, fitted: RenderedView | None = None
+) -> Causes:
+    """Of one photo, as JSON values: `mse`, its mean squared error (white is 1); the parts of it, in the order
+    of PARTS; and `levels`, the root mean square error of each patch of PATCH px (None: masked).
+
+    `maps`: of `pixel_maps`; `noise`: the photo's own, its deviation, white is 1; `fitted`: with its camera
+    fitted.
+    """
+    hanging, photos = maps
     photo = as_floats(seen.photo).astype(np.float64)
     counted = np.ones(photo.shape[:2], bool) if seen.mask is None else seen.mask
     first = seen.render.clip(0, 1) - photo
@@ -99,28 +85,23 @@ def causes(seen: RenderedView, maps: Maps, noise: float, fitted: RenderedView | 
         if now < after:
             off, pose = other, after - now
     error, fine = np.square(off).mean(-1), np.square(off - _smooth(off)).mean(-1)
-    edge = counted & (maps.photos < ENOUGH_SHOW)
-    fog = counted & ~edge & (maps.fog > FOG)
+    edge = counted & (photos < ENOUGH_SHOW)
+    fog = counted & ~edge & (hanging > FOG)
     rest, pixels = counted & ~edge & ~fog, int(counted.sum())
     detail = min(float(fine[rest].sum()), float(error[rest].sum())) / pixels
     own = min(detail, noise**2 * int(rest.sum()) / pixels)
-    contrasts = [
-        np.square(image - _smooth(image))[counted].sum() for image in (seen.render.clip(0, 1), photo)
-    ]
-    return Causes(
-        mse=mse,
-        color=mse - after,
-        pose=pose,
-        edge=float(error[edge].sum()) / pixels,
-        fog=float(error[fog].sum()) / pixels,
-        noise=own,
-        detail=detail - own,
-        broad=float(error[rest].sum()) / pixels - detail,
-        edge_area=int(edge.sum()) / pixels,
-        fog_area=int(fog.sum()) / pixels,
-        contrast=float(np.sqrt(contrasts[0] / contrasts[1])) if contrasts[1] > 0 else None,
-        levels=_patches(np.square(first).mean(-1), counted),
-    )
+    parts = {
+        "color": mse - after,
+        "pose": pose,
+        "edge": float(error[edge].sum()) / pixels,
+        "fog": float(error[fog].sum()) / pixels,
+        "noise": own,
+        "detail": detail - own,
+        "broad": float(error[rest].sum()) / pixels - detail,
+    }
+    levels = _patches(np.square(first).mean(-1), counted)
+    told = [[None if np.isnan(v) else round(float(v), 1) for v in row] for row in levels]
+    return {"mse": mse, **parts, "levels": told}
 
 
 def noise_of(view: View) -> float:
@@ -131,14 +112,8 @@ def noise_of(view: View) -> float:
 
 def shares(of: Sequence[Causes]) -> dict[str, float]:
     """Each part of the squared error of all photos together; their sum is 1; all 0 without an error."""
-    whole = sum(one.mse for one in of) or 1.0
-    return {part: sum(getattr(one, part) for one in of) / whole for part in PARTS}
-
-
-def json_of(one: Causes) -> dict[str, object]:
-    """As JSON values, the map of errors rounded to a tenth of a level."""
-    levels = [[None if np.isnan(v) else round(float(v), 1) for v in row] for row in one.levels]
-    return {**asdict(one), "levels": levels}
+    whole = sum(one["mse"] for one in of) or 1.0
+    return {part: sum(one[part] for one in of) / whole for part in PARTS}
 
 
 def _aligned(seen: RenderedView, photo: Floats) -> Floats:

@@ -15,7 +15,7 @@ import torch
 from hqgs._rust import get_num_threads
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
-from hqgs.evaluation.causes import Causes, causes, json_of, noise_of, pixel_maps, shares, shown_by
+from hqgs.evaluation.causes import Causes, causes, noise_of, pixel_maps, shares, shown_by
 from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.evaluation.fit_cameras import Fitted, fit_cameras
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView, held_out_renders, measured
@@ -76,7 +76,7 @@ class Judged:
             known["fitted"] = numbers(self.names, self.again, moved)
         known["causes"] = shares([one for one in self.causes if one is not None])
         for name, one in zip(self.names, self.causes, strict=True):
-            known["views"][name]["causes"] = None if one is None else json_of(one)
+            known["views"][name]["causes"] = one
         return known
 
 

@@ -73,7 +73,7 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
         other=names[1],
         pairs=[_pair(judged, number, one["views"], against) for number in chosen],
         pairs_left=len(order) - len(chosen),
-        photo_heads=["photo", *(LABELS[name] for name in shown), "fine contrast", "causes of the error"],
+        photo_heads=["photo", *(LABELS[name] for name in shown), "causes of the error"],
         photos=[_row(name, one["views"][name], shown) for name in order],
         protocol=_protocol(protocol),
     )
@@ -90,9 +90,8 @@ def _row(name: str, view: dict[str, Any], shown: Sequence[str]) -> list[str]:
     values = ["-" if view[metric] is None else format(view[metric], FORMS[metric]) for metric in shown]
     causes = view["causes"]
     if causes is None or not causes["mse"]:
-        return [name, *values, "-", "-"]
-    contrast = "-" if causes["contrast"] is None else f"{causes['contrast']:.0%}"
-    return [name, *values, contrast, cause_words({part: causes[part] / causes["mse"] for part in CAUSES})]
+        return [name, *values, "-"]
+    return [name, *values, cause_words({part: causes[part] / causes["mse"] for part in CAUSES})]
 
 
 def _pair(
