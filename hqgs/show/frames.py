@@ -23,7 +23,6 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.model.formats.arrays import curve_order
 from hqgs.model.formats.turned import matrices
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.rasterization import rasterization
 from hqgs.photos.look import Look
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.photos.video import FPS, pyav
@@ -165,18 +164,12 @@ class Activated:
         with one_torch_thread():
             g = g.rows(torch.from_numpy(curve_order(g.means.numpy())))
         self.degree: int = g.sh_degree
-        near = g.near_plane()
-        self._how: dict[str, Any] = {
-            "near_plane": near,
-            "rasterize_mode": "antialiased" if g.antialiased else "classic",
-            "packed": False,
-        }
-        self.gaussians = g
-        self._tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities()
-        means, quats, scales, opacities, sh0 = (t.contiguous().numpy() for t in (*self._tensors, g.sh0))
+        self.gaussians, self._near = g, g.near_plane()
+        tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities(), g.sh0
         rest = g.shN.contiguous().numpy() if g.sh_degree else None
+        means, quats, scales, opacities, sh0 = (tensor.contiguous().numpy() for tensor in tensors)
         self._arrays = means, quats, scales, opacities, sh0, rest
-        self._options = (near, FAR_PLANE, 0.0, EPS2D, g.antialiased, False)
+        self._options = (self._near, FAR_PLANE, 0.0, EPS2D, g.antialiased, False)
 
     @torch.no_grad()
     def color(
@@ -184,19 +177,17 @@ class Activated:
     ) -> Picture:
         """[H, W, 3], clipped and rounded to 8 bits."""
         if look is not None:
-            near = self._how["near_plane"]
             with one_torch_thread():
                 image, _, _ = self.gaussians.rasterize(
-                    camera, sh_degree=self.degree, background=background, near_plane=near
+                    camera, sh_degree=self.degree, background=background, near_plane=self._near
                 )
                 seen = torch.from_numpy(look.of(image[0].numpy(), camera.K))
                 return seen.mul_(255).round_().clamp_(0, 255).byte().numpy()
-        means, quats, scales, opacities, sh0, rest = self._arrays
         viewmat, K = (np.ascontiguousarray(m[None], np.float64) for m in (camera.viewmat, camera.K))
         width, height = camera.width, camera.height
         picture = _rust.pictures(
-            means, quats, scales, opacities, sh0, rest, viewmat, K, width, height, self._options,
-            self.degree, np.array([[*background]], means.dtype),
+            *self._arrays, viewmat, K, width, height, self._options,
+            self.degree, np.array([[*background]], self._arrays[0].dtype),
         )  # fmt: skip
         return picture.reshape(height, width, 3)
 
@@ -204,21 +195,18 @@ class Activated:
     def depth(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Expected depth along the viewing axis, world units, and alpha, both [H, W]."""
         with one_torch_thread():
-            means, quats, scales, opacities = self._tensors
-            none = means.new_zeros(len(means), 1)
-            image, alpha, _ = rasterization(
-                means, quats, scales, opacities, none, *_of(camera), render_mode="ED", **self._how
+            image, alpha, _ = self.gaussians.rasterize(
+                camera, self.gaussians.sh0[:, 0], render_mode="ED", near_plane=self._near
             )
         return image[0, ..., 0].float().numpy(), alpha[0, ..., 0].float().numpy()
 
     @torch.no_grad()
     def thickness(self, at: NDArray[np.float64], ahead: NDArray[np.float64]) -> float:
         """Median standard deviation along a direction, unit [3], of eight Gaussians around a point [3]."""
-        means, quats, scales, _ = self._tensors
-        apart = (means - torch.from_numpy(at).to(means)).square().sum(1)
-        rows = apart.topk(min(8, len(means)), largest=False).indices
-        own = ahead @ matrices(quats[rows].double().numpy())  # along the Gaussians' axes
-        return float(np.median(np.linalg.norm(own * scales[rows].numpy(), axis=1)))
+        means, quats, scales, *_ = self._arrays
+        rows = np.argsort(np.square(means - at).sum(1), kind="stable")[:8]
+        own = ahead @ matrices(quats[rows].astype(np.float64))  # along the Gaussians' axes
+        return float(np.median(np.linalg.norm(own * scales[rows], axis=1)))
 
 
 def depth_range(samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> tuple[float, float]:
@@ -256,10 +244,6 @@ def _colored(share: NDArray[np.floating], light: NDArray[np.float32] | float) ->
 def grey(alpha: NDArray[np.float32]) -> Picture:
     level = np.rint(255 * alpha.clip(0, 1)).astype(np.uint8)
     return np.repeat(level[..., None], 3, axis=2)
-
-
-def _of(camera: Camera) -> tuple[torch.Tensor, torch.Tensor, int, int]:
-    return torch.tensor(camera.viewmat[None]), torch.tensor(camera.K[None]), camera.width, camera.height
 
 
 def _counted(pictures: Iterator[Picture], total: int, progress: OnFrame | None) -> Iterator[Picture]:
