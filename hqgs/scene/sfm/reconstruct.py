@@ -32,12 +32,10 @@ def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent
     ValueError for fewer than 3 photos, or where less than half of them, or fewer than 3, are registered.
     """
     views = {f"{k:05d}.png": view for k, view in enumerate(scene.train)}
-    cameras = [view.camera for view in scene.train]
-    contents = map(_content, views.values())
     ran = run_colmap(
         list(views),
-        contents,
-        cameras,
+        map(_content, views.values()),
+        [view.camera for view in scene.train],
         lambda folder: write_photos(folder, views),
         keep,
         on_stage,
@@ -60,6 +58,7 @@ def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent
     tracks = TrackStatistics(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
     off = float(np.median(misses))  # infinite where the own cameras have most of the points behind them
     distances, _ = KDTree(scene.points).query(points)
+    rotation, translation = _compared(viewmats, own, scene.extent)
     report = SfmReport(
         photos=len(views),
         not_registered=[view.name for file, view in views.items() if file not in poses],
@@ -75,7 +74,9 @@ def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent
         first_pass=ran.first_pass,
         lost=ran.lost(),
         sure_px={views[file].name: px for file, px in sureness(model).items()},
-        **_compared(viewmats, own, scene.extent, len(views)),
+        rotation_error_deg=rotation,
+        translation_error=translation,
+        auc=dict(zip("135", pose_auc(viewmats, own, len(views)), strict=True)),
     )
     return replace(
         scene,
@@ -96,12 +97,11 @@ def _content(view: View) -> bytes:
     return to_uint8(as_floats(view.image)).tobytes() + mask
 
 
-def _compared(found: Floats, own: Floats, extent: float, photos: int) -> dict[str, dict[str, float]]:
-    """How far poses are off the scene's own, world-to-camera matrices [V, 4, 4], of so many photos."""
+def _compared(found: Floats, own: Floats, extent: float) -> tuple[dict[str, float], dict[str, float]]:
+    """How far poses are off the scene's own, world-to-camera matrices [V, 4, 4]: degrees; in extents."""
     degrees = np.rad2deg(rotation_angles(np.einsum("nij,nkj->nik", found[:, :3, :3], own[:, :3, :3])))
     apart = np.linalg.norm(camera_centers(found) - camera_centers(own), axis=1) / extent
-    return {
-        "rotation_error_deg": {"median": float(np.median(degrees)), "max": float(degrees.max())},
-        "translation_error": {"median": float(np.median(apart)), "max": float(apart.max())},
-        "auc": dict(zip("135", pose_auc(found, own, photos), strict=True)),
-    }
+    rotation, translation = (
+        {"median": float(np.median(off)), "max": float(off.max())} for off in (degrees, apart)
+    )
+    return rotation, translation
