@@ -313,19 +313,19 @@ def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str) -> 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (None, "is damaged: "),
-        ({"train": ["view1.png"]}, "train must be an object"),
-        ({"held_out": "view0.png"}, "held_out and notes lists of text"),
-        ({"notes": [3]}, "held_out and notes lists of text"),
-        ({"train": {"view1.png": 3}}, r"the small photo of 'view1\.png' is 3"),
+        (None, "is not valid JSON: "),
+        ({"train": ["view1.png"]}, r"is damaged: train is \['view1\.png'\], wanted dict"),
+        ({"held_out": "view0.png"}, "held_out is 'view0.png', wanted list"),
+        ({"notes": [3]}, r"notes\[0\] is 3, wanted str"),
+        ({"train": {"view1.png": 3}}, r"train\['view1\.png'\] is 3, wanted str"),
         ({"train": {"view1.png": "../clean.png"}}, "leaves the folder"),
         ({"train": {"view1.png": "images/../low/view9.png"}}, "has no small photo"),
         ({"train": {"view1.png": "large.png"}}, r"large\.png is 25 x 16, its photo 24 x 16"),
         ({"more": 1}, "is damaged: .*more"),
-        ({"version": 3}, "is damaged: the version is 3, and only 1 and 2 are known"),
-        ({"steps": []}, "steps must be an object"),
-        ({"steps": {"view1.png": {}}}, r"the steps of 'view1\.png' are {}"),
-        ({"steps": {"view1.png": ["blur"]}}, r"the steps of 'view1\.png' are \['blur'\]"),
+        ({"version": 3}, "is damaged: the version is 3, and only 2 is known"),
+        ({"steps": []}, r"steps is \[\], wanted dict"),
+        ({"steps": {"view1.png": {}}}, r"steps\['view1\.png'\] is {}, wanted list"),
+        ({"steps": {"view1.png": ["blur"]}}, r"steps\['view1\.png'\]\[0\] is 'blur', wanted dict"),
     ],
 )
 def test_a_damaged_description_is_refused(

@@ -49,6 +49,10 @@ def _value(hint: Any, value: Any, where: str, name: str, base: Any = None) -> An
         return tuple(
             _value(h, v, where, f"{name}[{k}]") for k, (h, v) in enumerate(zip(hints, value, strict=True))
         )
+    if kind is list and isinstance(value, list):
+        return [_value(args[0], v, where, f"{name}[{k}]") for k, v in enumerate(value)]
+    if kind is dict and isinstance(value, dict):
+        return {key: _value(args[1], v, where, f"{name}[{key!r}]") for key, v in value.items()}
     if is_dataclass(kind) and isinstance(kind, type) and not isinstance(value, kind):
         return build(kind, value, where, base, f"{name}.")
     if kind is float and type(value) is int:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hqgs.base.files import write_json
+from hqgs.base.files import read_json, write_json
+from hqgs.base.typed import build
 from hqgs.photos.files import decode, stored_size
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.capture import inside
 from hqgs.scene.scene import View
 
 FILE = "degradation.json"
-VERSION = 2  # 1, which files do not name, has no steps
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class DegradedFolder:
     train: dict[str, str | None]  # the degraded photos, each with its small photo's path in the scene folder
     held_out: list[str]  # the clean photos
     notes: list[str]  # for `Scene.notes`
-    # of each degraded photo what happened to it, as `degrade_image` says; files of version 1 do not tell
+    # of each degraded photo what happened to it, as `degrade_image` says
     steps: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
 
 
@@ -43,26 +43,10 @@ def read_degraded_folder(root: Path) -> DegradedFolder | None:
     path = root / FILE
     if not path.is_file():
         return None
-    try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
-        if (version := facts.pop("version", 1)) not in (1, VERSION):
-            raise ValueError(f"the version is {version!r:.80}, and only 1 and {VERSION} are known")
-        folder = DegradedFolder(**facts)
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    lists = (folder.held_out, folder.notes)
-    sound = all(isinstance(items, list) and all(isinstance(i, str) for i in items) for items in lists)
-    if not (sound and isinstance(folder.train, dict)):
-        raise ValueError(f"{path} is damaged: train must be an object, held_out and notes lists of text")
-    if not isinstance(folder.steps, dict):
-        raise ValueError(f"{path} is damaged: steps must be an object")
-    for name, steps in folder.steps.items():
-        if not (isinstance(steps, list) and all(isinstance(step, dict) for step in steps)):
-            raise ValueError(f"{path} is damaged: the steps of {name!r} are {steps!r:.80}")
-    for name, low in folder.train.items():
-        if not (low is None or isinstance(low, str)):
-            raise ValueError(f"{path} is damaged: the small photo of {name!r} is {low!r:.80}")
-    return folder
+    facts = read_json(path)
+    if isinstance(facts, dict) and (version := facts.pop("version", 1)) != VERSION:
+        raise ValueError(f"{path} is damaged: the version is {version!r:.80}, and only {VERSION} is known")
+    return build(DegradedFolder, facts, f"{path} is damaged")
 
 
 def with_low(view: View, folder: DegradedFolder, root: Path) -> View:
