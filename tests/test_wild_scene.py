@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -144,19 +143,6 @@ def test_a_photo_follows_from_what_the_folder_tells(tmp_path: Path) -> None:
     for old, result in degraded_views(scene, parse_degradation("phone:2"), 3):
         file = (tmp_path / "phone" / "images" / old.name).with_suffix(".jpg")
         assert file.read_bytes() == result.jpeg
-
-
-def test_files_of_the_first_version_are_read(tmp_path: Path) -> None:
-    write_degraded_scene(tiny_scene(), tmp_path / "out", parse_degradation("noise:9"), 0)
-    path = tmp_path / "out" / "degradation.json"
-    facts = json.loads(path.read_text())
-    assert facts.pop("version") == 2
-    del facts["steps"]
-    path.write_text(json.dumps(facts))
-    folder = read_degraded_folder(tmp_path / "out")
-    assert folder is not None
-    assert (folder.kind, folder.steps) == ("noise:9", {})
-    assert len(load_scene(tmp_path / "out").train) == 5
 
 
 def test_a_film_of_one_photo_is_stored_at_its_size(tmp_path: Path) -> None:
