@@ -152,8 +152,7 @@ def test_what_is_decided_later_is_added_and_a_resumed_run_reads_the_same(tmp_pat
     config = tiny_config(30, turn=(20, 26))
     trainer = Trainer(tiny_scene(), config)
     before = trainer.plan
-    run_until(trainer, 22)
-    assert trainer.plan is before
+    assert run_until(trainer, 22).plan is before
     assert [(row.what, row.value, row.iteration) for row in trainer.state.rows] == [
         ("length", "26 iterations", 20)
     ]
@@ -161,6 +160,7 @@ def test_what_is_decided_later_is_added_and_a_resumed_run_reads_the_same(tmp_pat
     again = Trainer(tiny_scene(), config)
     again.restore(tmp_path / "checkpoint")
     assert again.rows == trainer.rows
+    assert run_until(again).iteration == 26
 
 
 def test_a_run_of_seconds_resumes_by_the_same_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
