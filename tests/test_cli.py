@@ -345,7 +345,7 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
 ) -> None:
     assert call("train", "embedded", "--out", tmp_path, "--iterations", "3") == 0
     *_, quality, time, send, now = capsys.readouterr().out.splitlines()
-    assert quality.startswith("quality: poor (below 20 dB ")
+    assert quality.startswith("quality: poor (below 20 dB: ")
     assert "loading" in time
     assert "preparing" in time
     assert str(tmp_path / "report.html") in send

@@ -88,7 +88,7 @@ def test_half_tones_and_16_bits(tmp_path: Path) -> None:
     Image.fromarray(grey8 > 99).save(tmp_path / "c.png")
     np.testing.assert_array_equal(decode(tmp_path / "c.png")[0][..., 1], (grey8 > 99) * 255)
     Image.fromarray(grey8.astype(np.float32)).save(tmp_path / "d.tif")
-    with pytest.raises(ValueError, match=r"d\.tif: floating-point"):
+    with pytest.raises(ValueError, match=r"d\.tif: pixels are floating-point"):
         decode(tmp_path / "d.tif")
 
 

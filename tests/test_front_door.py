@@ -144,7 +144,7 @@ def test_frames_are_asked_of_films_alone(tmp_path: Path) -> None:
         lambda: load(tmp_path, frames=9),
         lambda: write_colmap_folder(tmp_path, tmp_path, tmp_path, 9),
     ):
-        with pytest.raises(ValueError, match=r"frames is for films, and .* is none"):
+        with pytest.raises(ValueError, match=r"frames is for films, and .* is not a film"):
             ask()
     with pytest.raises(ValueError, match="frames is for films"):
         load("embedded", frames=9)

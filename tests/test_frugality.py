@@ -34,9 +34,9 @@ def test_the_items_by_name() -> None:
     assert parse_leave_out("auto") == ("photos", "growth")
     assert parse_leave_out("none") == ()
     assert parse_leave_out("growth, photos") == ("photos", "growth")
-    with pytest.raises(ValueError, match="there is no 'colour'; there are: auto, none, or some of photos"):
+    with pytest.raises(ValueError, match="unknown 'colour'; wanted auto, none, or some of photos"):
         parse_leave_out("photos,colour")
-    with pytest.raises(ValueError, match="there is no 'colour'"):
+    with pytest.raises(ValueError, match="unknown 'colour'"):
         TrainConfig(leave_out=("colour",))
 
 

@@ -268,7 +268,7 @@ def test_a_bad_view_is_named(tmp_path: Path) -> None:
 def test_scene_without_held_out_views_gets_a_report(tmp_path: Path) -> None:
     got = write_report(tmp_path, result_of())
     assert got["metrics"]["mean"] == dict.fromkeys(METRICS)
-    assert got["metrics"]["reasons"] == dict.fromkeys(METRICS, "there is no held-out view")
+    assert got["metrics"]["reasons"] == dict.fromkeys(METRICS, "there is no held-out photo")
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def test_the_film_is_taken_not_its_cover_thumbnail_or_proxy(tmp_path: Path) -> N
         frames, note = frames_of(path, tmp_path)
         assert len(frames) == 4
         assert frames[0].shape == (HEIGHT, WIDTH, 3)
-        assert f"that of {WIDTH} x {HEIGHT} px" in note
+        assert f"the one of {WIDTH} x {HEIGHT} px" in note
 
 
 @pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
