@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.model.gaussians import Gaussians
+from hqgs.photos.degrade import Degraded, degrade_sequence
+from hqgs.photos.formula import Degradation
 from hqgs.photos.pixels import to_uint8
 from hqgs.scene.scene import Camera
 
@@ -165,3 +167,10 @@ def subset(truth: Truth, keep: list[int]) -> Truth:
         viewmats=truth.viewmats[keep],
         photos=[truth.photos[i] for i in keep],
     )
+
+
+def degrade_image(
+    image: NDArray[Any], degradation: Degradation, rng: np.random.Generator, factor: float | None = None
+) -> Degraded:
+    """One photo, as `degrade_sequence` degrades it."""
+    return degrade_sequence([image], degradation, [rng], [factor])[0]

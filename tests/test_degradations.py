@@ -8,11 +8,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from fixtures_scenes import degrade_image
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage, stats
 
-from hqgs.photos.degrade import Degraded, convolve, degrade_image, gaussian_blur, shrink
+from hqgs.photos.degrade import Degraded, convolve, gaussian_blur, shrink
 from hqgs.photos.formation import disc_kernel, motion_kernel
 from hqgs.photos.formula import KINDS, MIXED_STEPS, NOT_MADE, Degradation, parse_degradation
 from hqgs.photos.resize import resize

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fixtures_scenes import make_truth, write_colmap
+from fixtures_scenes import degrade_image, make_truth, write_colmap
 from PIL import Image
 from tiny_scene import tiny_scene
 
 import hqgs.scene.degrade
-from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.jpeg import encode_jpeg
 from hqgs.photos.pixels import to_uint8

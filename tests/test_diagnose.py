@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from fixtures_scenes import degrade_image
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from scipy.ndimage import gaussian_filter, uniform_filter1d
@@ -25,7 +26,6 @@ import hqgs.diagnosis.scene as module
 from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene
 from hqgs.diagnosis.photo import inspect_photo
 from hqgs.diagnosis.scene import Inspector
-from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formula import parse_degradation, parse_formation
 from hqgs.photos.jpeg import encode_jpeg
 from hqgs.photos.pixels import as_floats

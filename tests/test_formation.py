@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from fixtures_scenes import degrade_image
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formation import Kernel, Separable, blur_matrix, formation
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.jpeg import tables_of_quality

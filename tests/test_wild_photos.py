@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from fixtures_scenes import degrade_image
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
@@ -25,7 +26,7 @@ from benchmarks.scenes.shake import (
     shake_kernel,
 )  # fmt: skip
 from benchmarks.scenes.video import film
-from hqgs.photos.degrade import degrade_image, degrade_sequence
+from hqgs.photos.degrade import degrade_sequence
 from hqgs.photos.formation import formation
 from hqgs.photos.formula import KINDS, OWN, parse_degradation, parse_formation
 from hqgs.photos.light import to_linear, to_srgb

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fixtures_scenes import degrade_image
 from PIL import Image
 from tiny_scene import tiny_scene
 
 from benchmarks.scenes.kinds import shake
 from benchmarks.scenes.video import film
-from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.degrade import degrade_scene, degraded_views, write_degraded_scene

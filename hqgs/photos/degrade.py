@@ -35,35 +35,22 @@ class Degraded:
     records: list[Record] = field(default_factory=list)  # one for each step that happened to this photo
 
 
-def degrade_image(
-    image: NDArray[np.uint8] | Float32,
-    degradation: Degradation,
-    rng: np.random.Generator,
-    factor: float | None = None,
-) -> Degraded:
-    """Apply the steps to a clean photo [H, W, 3], uint8 or float32 with white at 1.
-
-    Low-res makes the photo small; later steps then happen to the small photo, and at the end bicubic
-    resizing brings it back to H x W. What is random comes from `rng`, in the order of the steps. A `some`
-    step happens with `factor` times its value, and not at all without one. ValueError for a photo of another
-    type or shape, one that is not finite, or a blur too wide for it.
-
-    What the records hold beside "kind" and "value" (the step's, with its factor):
-    motion: "direction" (radians from x towards y, which points down).
-    """
-    return degrade_sequence([image], degradation, [rng], [factor])[0]
-
-
 def degrade_sequence(
     images: Sequence[NDArray[np.uint8] | Float32],
     degradation: Degradation,
     rngs: Sequence[np.random.Generator],
     factors: Sequence[float | None],
 ) -> list[Degraded]:
-    """Apply the steps to photos in the order of a film: only `video` lets one photo depend on another.
+    """Apply the steps to clean photos [H, W, 3], uint8 or float32 with white at 1.
 
-    Each photo has its generator and its factor as in `degrade_image`. ValueError as there, or for photos of
-    several sizes before a video.
+    Only a film (`FILMS`) lets one photo depend on another. Low-res makes a photo small; later steps then
+    happen to the small photo, and at the end bicubic resizing brings it back to H x W. What is random comes
+    from the photo's generator, in the order of the steps. A `some` step happens with the photo's factor times
+    its value, and not at all without one. ValueError for a photo of another type or shape, one that is not
+    finite, a blur too wide for it, or photos of several sizes before a film.
+
+    What the records hold beside "kind" and "value" (the step's, with its factor):
+    motion: "direction" (radians from x towards y, which points down).
     """
     photos = [_Photo(image, rng) for image, rng in zip(images, rngs, strict=True)]
     all_steps = [degradation.for_width(*photo.size).steps for photo in photos]

@@ -158,7 +158,7 @@ def parse_degradation(text: str) -> Degradation:
 
     | step | what happens | where |
     |---|---|---|
-    | `jpeg:Q`, `noise:S`, `lowres:N` | a quality, sigma in levels, a factor | `degrade_image` |
+    | `jpeg:Q`, `noise:S`, `lowres:N` | a quality, sigma in levels, a factor | `degrade_sequence` |
     | `blur[:SIGMA]`, `defocus[:R]`, `motion[:LENGTH]` | one kernel, in px, on the values as stored | same |
     | `mixed` | `blur+lowres:2+noise:10+jpeg:20` | |
     | `some:STEP` | the step in half of the training photos only, at mixed strengths | `hqgs.scene.degrade` |

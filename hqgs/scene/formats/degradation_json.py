@@ -26,7 +26,7 @@ class DegradedFolder:
     train: dict[str, str | None]  # the degraded photos, each with its small photo's path in the scene folder
     held_out: list[str]  # the clean photos
     notes: list[str]  # for `Scene.notes`
-    # of each degraded photo what happened to it, as `degrade_image` says
+    # of each degraded photo what happened to it, as `degrade_sequence` says
     steps: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
 
 
