@@ -171,10 +171,8 @@ def test_the_report_tells_what_was_left_out(tmp_path: Path) -> None:
 
 def test_the_table() -> None:
     assert format_left_out([]) == ""
-    items = [LeftOut("a", "not needed", bytes=2_500_000, cost_db=0.01), LeftOut("bcd", "no use")]
-    assert format_left_out(items) == (
-        "left out:\n  a    2.5 MB, -0.01 dB  not needed\n  bcd                    no use"
-    )
+    items = [LeftOut("a", "not needed"), LeftOut("bcd", "no use")]
+    assert format_left_out(items) == "left out:\n  a    not needed\n  bcd  no use"
     table = format_left_out([LeftOut(f"{CORRECTION}blur", "sharp"), *items, LeftOut(f"{CORRECTION}jpeg", "")])
     *rest, last = table.splitlines()[1:]
     assert last.split(None, 1) == ["corrections", "not needed for blur, jpeg"]

@@ -15,7 +15,7 @@ PHOTO = "training photo "  # and its name
 CORRECTION = "a correction for "  # and the step of the formation, of what the photos do not show
 DIAGNOSIS = "diagnosis of "  # and what was not measured in each photo
 MOST_ROWS = 5  # on the screen
-Row = tuple[str, str, str]  # what, saved, why
+Row = tuple[str, str]  # what, why
 
 
 class LeftOutRecord(TypedDict):
@@ -24,8 +24,6 @@ class LeftOutRecord(TypedDict):
     what: str
     why: str
     evidence: NotRequired[str]
-    bytes: NotRequired[int]
-    cost_db: NotRequired[float]
 
 
 @dataclass(frozen=True)
@@ -35,8 +33,6 @@ class LeftOut:
     what: str
     why: str
     evidence: str | None = None  # what was measured to decide it
-    bytes: int | None = None  # of the scene file saved
-    cost_db: float | None = None  # lost in PSNR on training photos that were held back; below 0: gained
 
     def known(self) -> LeftOutRecord:
         """The fields that are known, as plain JSON values."""
@@ -45,29 +41,27 @@ class LeftOut:
 
 
 def format_left_out(items: Sequence[LeftOut]) -> str:
-    """A table of at most MOST_ROWS of what was left out and what that saved; empty if nothing was.
+    """A table of at most MOST_ROWS of what was left out, and why; empty if nothing was.
 
     Photos come first, then what else changes the scene, last what only saved time. The report has all of it.
     """
     photos, rows, steps, looks = dict[str, list[str]](), list[Row](), list[str](), list[Row]()
     for item in items:
-        saved = [] if item.bytes is None else [f"{item.bytes / 1e6:.1f} MB"]
-        saved += [] if item.cost_db is None else [f"{-item.cost_db:+.2f} dB"]
         if item.what.startswith(PHOTO):
             photos.setdefault(item.why, []).append(item.what.removeprefix(PHOTO))
         elif item.what.startswith(CORRECTION):
             steps.append(item.what.removeprefix(CORRECTION))
         else:
             found = looks if item.what.startswith(DIAGNOSIS) else rows
-            found.append((item.what, ", ".join(saved), item.why))
-    gone = [(f"training photos: {len(names)}", "", f"{some(names)}: {why}") for why, names in photos.items()]
-    needless = [("corrections", "", f"not needed for {', '.join(steps)}")] if steps else []
+            found.append((item.what, item.why))
+    gone = [(f"training photos: {len(names)}", f"{some(names)}: {why}") for why, names in photos.items()]
+    needless = [("corrections", f"not needed for {', '.join(steps)}")] if steps else []
     rows = [*gone, *rows, *needless, *looks]
     if not rows:
         return ""
     if len(rows) > MOST_ROWS:
         rest = len(rows) - MOST_ROWS + 1
-        rows = [*rows[:-rest], (f"and {rest} more", "", "the report has them all")]
-    widths = [max(len(row[k]) for row in rows) for k in range(2)]
-    lines = [f"  {what:{widths[0]}}  {saved:{widths[1]}}  {why}" for what, saved, why in rows]
+        rows = [*rows[:-rest], (f"and {rest} more", "the report has them all")]
+    width = max(len(what) for what, _ in rows)
+    lines = [f"  {what:{width}}  {why}" for what, why in rows]
     return "\n".join(["left out:", *lines])

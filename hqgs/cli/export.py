@@ -108,8 +108,7 @@ def run(args: ExportScene) -> int:
     print(changed)
     for entry in written.left_out:
         evidence = "" if entry.evidence is None else f" ({entry.evidence})"
-        saved = "" if entry.bytes is None else f": {entry.bytes:,} bytes"
-        print(f"left out: {entry.what}: {entry.why}{evidence}{saved}")
+        print(f"left out: {entry.what}: {entry.why}{evidence}")
     for name, count in written.clipped.items():
         print(f"outside the range of spz, set to its end: {count:,} values of {name}")
     return 0

@@ -10,7 +10,6 @@ Gaussian's opacity bounds its weight in a pixel. Renders of what was written, re
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,47 +55,30 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
     Raises ValueError where SPZ cannot hold the scene (see `hqgs.model.formats.spz.encode_spz`).
     """
     path = Path(path)
-    steps = reduce_gaussians(gaussians, options)
-    reduced = steps[-1].gaussians if steps else gaussians
+    reduced, left_out = reduce_gaussians(gaussians, options)
     clipped = _write(reduced, path, options)
-    written, left_out = path.stat().st_size, list[LeftOut]()
-    size, before = FORMATS[options.format].size, gaussians
-    for step in steps:
-        saved = None if size is None else _size(size, before) - _size(size, step.gaussians)
-        left_out.append(LeftOut(step.what, step.why, step.evidence, bytes=saved))
-        before = step.gaussians
     if gaussians.antialiased and not FORMATS[options.format].antialiased:
         why = f"a .{options.format} file cannot store it; detail finer than a pixel is shown too opaque"
         left_out.append(LeftOut("the antialias flag", why))
     if gaussians.errors is not None and not FORMATS[options.format].errors:
         left_out.append(LeftOut("trust of the Gaussians", f"a .{options.format} file cannot store it"))
-    return Export(path, written, len(reduced), reduced.sh_degree, left_out, clipped)
+    return Export(path, path.stat().st_size, len(reduced), reduced.sh_degree, left_out, clipped)
 
 
-@dataclass(frozen=True)
-class Reduction:
-    """A part that was left out, and the Gaussians after that."""
-
-    gaussians: Gaussians
-    what: str
-    why: str
-    evidence: str | None = None
-
-
-def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Reduction]:
-    """What is left out in turn; nothing: an empty list. The Gaussians given stay what they are."""
-    steps: list[Reduction] = []
+def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> tuple[Gaussians, list[LeftOut]]:
+    """What the options leave of them, and what is left out in turn. Those given stay as they are."""
+    left_out = list[LeftOut]()
     g = gaussians.detached()
     n = len(g)
     finite = g.finite()
     visible = (g.activated_opacities() >= ALPHA_MIN) & (g.quats.square().sum(dim=1) >= QUAT_NORM2_MIN)
-    for keep, others, why in (
-        (finite, n, "their values are NaN or Inf"),
-        (finite & visible, int(finite.sum()), "invisible: opacity below 1/255, or no rotation"),
+    for gone, why in (
+        (n - int(finite.sum()), "their values are NaN or Inf"),
+        (int((finite & ~visible).sum()), "invisible: opacity below 1/255, or no rotation"),
     ):
-        if (gone := others - int(keep.sum())) > 0:
-            steps.append(Reduction(gaussians.detached().rows(keep), f"{gone:,} Gaussians", why))
-    g = steps[-1].gaussians if steps else g
+        left_out += [LeftOut(f"{gone:,} Gaussians", why)] if gone else []
+    if left_out:
+        g = g.rows(finite & visible)
 
     degrees = needed_degrees(g, options.band_tolerance)
     most = min(options.sh_degree, g.sh_degree) if FORMATS[options.format].harmonics else 0
@@ -116,13 +98,14 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Reduc
             f"degree {degree + 1}" if degree + 1 == g.sh_degree else f"degrees {degree + 1} to {g.sh_degree}"
         )
         g = _cut(g, degree)
-        steps.append(Reduction(g, f"harmonics of {bands}", why, evidence))
+        left_out.append(LeftOut(f"harmonics of {bands}", why, evidence))
     if options.format == "spz":  # zeros save nothing in the others, and in SOG little: 4 % of a file for 6 dB
         fewer = _without_bands(g, degrees)
         if changed := int((fewer.shN != g.shN).flatten(1).any(dim=1).sum()):
             why = f"they change colours by at most {options.band_tolerance:g}"
-            steps.append(Reduction(fewer, f"the highest harmonics of {changed:,} Gaussians", why))
-    return steps
+            left_out.append(LeftOut(f"the highest harmonics of {changed:,} Gaussians", why))
+            g = fewer
+    return g, left_out
 
 
 def needed_degrees(gaussians: Gaussians, tolerance: float) -> Tensor:
@@ -175,10 +158,6 @@ def _write(gaussians: Gaussians, path: Path, options: ExportOptions) -> dict[str
     clipped = write_spz(path, arrays, options.sh_bits, options.spz_version).clipped
     keep_world(path, gaussians.world)
     return clipped
-
-
-def _size(size: Callable[[int, int, bool], int], g: Gaussians) -> int:
-    return size(len(g), 3 * g.shN.shape[1], g.errors is not None)
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,6 @@ class Format:
     errors: bool = False  # what trust was learned
     antialiased: bool = False  # that flag
     harmonics: bool = True
-    # Bytes without header of so many Gaussians, with so many values of harmonics each, and errors or not.
-    size: Callable[[int, int, bool], int] | None = None
 
 
 def writable(arrays: Arrays, what: str = "", *, curve: bool = False) -> tuple[Arrays, int]:

@@ -35,7 +35,6 @@ from hqgs.model.formats.arrays import (
     to_opacities,
     writable,
 )
-from hqgs.model.formats.ply import size_of
 from hqgs.model.formats.spz import FLIP_MEANS, FLIP_QUATS, FLIP_SH
 from hqgs.model.formats.turned import matrices, near_origin, placed, recolored
 from hqgs.photos.light import to_srgb
@@ -380,6 +379,6 @@ def _matrix(node: Any) -> Array:
 
 
 FORMATS = {
-    "glb": Format(read_gltf, write_gltf, (b"glTF",), world=True, errors=True, size=size_of),
+    "glb": Format(read_gltf, write_gltf, (b"glTF",), world=True, errors=True),
     "gltf": Format(read_gltf, world=True),
 }

@@ -32,14 +32,7 @@ from hqgs.model.formats.arrays import (
     to_logits,
     whole_rows,
 )
-from hqgs.model.formats.compressed_ply import (
-    BOUNDS,
-    CHUNK,
-    WORDS,
-    is_compressed_ply,
-    read_compressed_ply,
-    write_compressed_ply,
-)
+from hqgs.model.formats.compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
 from hqgs.model.formats.ply_comments import OURS, comments_of, told_by
 from hqgs.scene.world import World, world_for
 
@@ -222,33 +215,8 @@ def _read_any_ply(path: Path) -> Arrays:
     return read_compressed_ply(path) if is_compressed_ply(path) else read_ply(path)
 
 
-def size_of(n: int, harmonics: int, errors: bool) -> int:
-    """Bytes of float32 for every value."""
-    return 4 * n * (14 + harmonics + errors)
-
-
 FORMATS = {
-    "ply": Format(
-        _read_any_ply,
-        write_ply,
-        (b"ply\n", b"ply\r"),
-        world=True,
-        errors=True,
-        antialiased=True,
-        size=size_of,
-    ),
-    "full.ply": Format(
-        _read_any_ply,
-        partial(write_ply, full=True),
-        of="ply",
-        antialiased=True,
-        size=lambda n, *_: 4 * n * (17 + _REST_COUNTS[-1]),
-    ),
-    "compressed.ply": Format(
-        _read_any_ply,
-        write_compressed_ply,
-        of="ply",
-        antialiased=True,
-        size=lambda n, harmonics, _: n * (4 * len(WORDS) + harmonics) + -(-n // CHUNK) * 4 * len(BOUNDS),
-    ),
+    "ply": Format(_read_any_ply, write_ply, (b"ply\n", b"ply\r"), world=True, errors=True, antialiased=True),
+    "full.ply": Format(_read_any_ply, partial(write_ply, full=True), of="ply", antialiased=True),
+    "compressed.ply": Format(_read_any_ply, write_compressed_ply, of="ply", antialiased=True),
 }

@@ -60,4 +60,4 @@ def read_splat(path: Path) -> Arrays:
     }
 
 
-FORMATS = {"splat": Format(read_splat, write_splat, harmonics=False, size=lambda n, *_: ROW.itemsize * n)}
+FORMATS = {"splat": Format(read_splat, write_splat, harmonics=False)}

@@ -241,8 +241,7 @@ def _plan_row(row: PlanRowRecord) -> tuple[str, ...]:
 
 
 def _left_out(item: LeftOutRecord) -> tuple[str, ...]:
-    saved = f"{item['bytes'] / 1e6:.1f} MB" if "bytes" in item else ""
-    return item["what"], item["why"], item.get("evidence", ""), saved
+    return item["what"], item["why"], item.get("evidence", "")
 
 
 def _correction(item: Mapping[str, Any]) -> bool:
