@@ -20,7 +20,6 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.state import own_state
 from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
-from hqgs.evaluation.photo_facts import photo_record
 from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, RunRecord, WorldRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.evaluation.run_folder import RunFolder
@@ -32,7 +31,7 @@ from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import Said, TrainConfig, TrainOptions, decided, merged
 from hqgs.training.frame import Frame
-from hqgs.training.notes import learned_record, run_notes
+from hqgs.training.notes import learned_record, photo_record, run_notes
 from hqgs.training.plan import essential
 from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values, plan_values, resumed, said_by

@@ -11,10 +11,9 @@ import torch
 
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.metres import point_of
-from hqgs.scene.scene import Camera
 from hqgs.scene.world import World
 from hqgs.show.frames import Activated
-from hqgs.show.viewer.measure import Point, picked, told_distance, with_bar
+from hqgs.show.viewer.measure import Point, picked, told_distance
 from hqgs.show.viewer.viewer import Viewer
 
 FAR = 4.0  # of the wall that is looked at, world units
@@ -60,15 +59,6 @@ def test_a_distance_has_the_errors_of_its_ends() -> None:
     assert told_distance(a, b, World()).startswith(
         f"2.000 ± {2 * ends:.3f} units (95 %; the size of a unit is unknown"
     )
-
-
-def test_the_bar_is_as_long_as_it_says() -> None:
-    camera = Camera(400, 300, np.array([[350.0, 0, 200], [0, 350, 150], [0, 0, 1]]), np.eye(4))
-    shown = with_bar(np.full((300, 400, 3), 90, np.uint8), camera, FAR, METRE)
-    row = (shown[300 - 18] == 255).all(-1)
-    assert row.sum() == pytest.approx(0.5 / METRE.unit / FAR * 350, abs=1.5)  # half a metre
-    assert not np.array_equal(shown[250:280], np.full((30, 400, 3), 90, np.uint8))  # its length in words
-    assert np.array_equal(shown[:200], np.full((200, 400, 3), 90, np.uint8))
 
 
 def test_two_clicks_on_the_page_tell_a_distance(wall: Gaussians) -> None:

@@ -26,8 +26,6 @@ from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 import hqgs
 from hqgs.cli import main as cli
 from hqgs.cli import view
-from hqgs.evaluation.photo_facts import facts_of_photos
-from hqgs.evaluation.records import read_report
 from hqgs.scene import source
 from hqgs.scene.camera_files import load_cameras, load_path
 from hqgs.scene.paths import with_size
@@ -287,36 +285,6 @@ def test_the_page_in_a_browser(folder: Path, capsys: pytest.CaptureFixture[str])
         assert str(viewer._numbers.content).endswith("| Gaussians | many |")
 
 
-def test_the_page_says_what_the_report_says_of_a_photo(folder: Path) -> None:
-    with serving(folder) as viewer:
-        (held_out,) = (view.name for view in viewer._views.values() if view.held_out)
-        trained = next(view.name for view in viewer._views.values() if not view.held_out)
-        photo = {"name": trained, "width": 24, "height": 16, "blur": "motion", "blur_px": 3.25, "noise": 7.04}
-        photo |= {"jpeg_quality": None, "enlarged": 2}
-        learned = {
-            "name": trained,
-            "shake_px": 1.5,
-            "defocus_px": 1.5,
-            "focus": 2.0,
-            "gains": [2.0, 2.0, 2.0],
-        }
-        view = {"name": held_out, "psnr": 25.5, "ssim": None}
-        report = {"photos": [photo], "learned": [learned], "metrics": {"views": [view]}}
-        viewer.set_facts(facts_of_photos(report))
-        assert viewer._of_photo.content == ""
-        viewer._photo.value = trained
-        until(lambda: "motion, 3.25 px" in viewer._of_photo.content)
-        for row in (
-            "| noise | 7.0 levels |",
-            "| enlarged | x2 |",
-            "| shake | 1.5 px |",
-            "| exposure, stops | +1.00 |",
-        ):
-            assert row in viewer._of_photo.content
-        viewer._photo.value = held_out
-        until(lambda: viewer._of_photo.content.endswith("|---|---|\n| PSNR | 25.500 |"))
-
-
 def test_a_strangers_report_is_text_in_the_page() -> None:
     told = _table([("a|b", "<iframe srcdoc='x'>\n"), ("noise", "7 levels")])
     assert "<iframe" not in told
@@ -324,14 +292,6 @@ def test_a_strangers_report_is_text_in_the_page() -> None:
         "| a&#124;b | &lt;iframe srcdoc=&#x27;x&#x27;&gt;  |",
         "| noise | 7 levels |",
     ]
-
-
-def test_a_report_says_what_its_photos_suffer_from(tmp_path: Path) -> None:
-    run = hqgs.train(tiny_scene(), out=tmp_path, iterations=3)
-    facts = facts_of_photos(read_report(tmp_path / "report.json"))
-    assert {view.name for view in (*tiny_scene().train, *tiny_scene().test)} == facts.keys()
-    assert facts["view1.png"]["size"] == f"{WIDTH} x {HEIGHT}"
-    assert run.report["photos"][0]["enlarged"] == 1
 
 
 def test_a_path_that_was_made_in_the_page_is_rendered(folder: Path, tmp_path: Path) -> None:
@@ -431,30 +391,12 @@ def test_looking_on_does_not_change_a_run(tmp_path: Path) -> None:
         watched = hqgs.train(scene, config=tiny_config(), progress=live)
         assert Looking.pictures > 5
         assert live.viewer._scene is not None
-        shown = live.viewer._scene._tensors[0]  # neighbours together
+        shown = torch.from_numpy(live.viewer._scene._arrays[0])  # neighbours together
         assert torch.equal(shown.sort(dim=0).values, watched.model.means.sort(dim=0).values)
     finally:
         live.viewer.close()
     for name, tensor in alone.model.named().items():
         assert torch.equal(tensor, watched.model.named()[name]), name
-
-
-def test_while_it_trains_the_page_says_what_a_photo_suffers_from(tmp_path: Path) -> None:
-    scene, facts = tiny_scene(), list[dict[str, Any]]()
-    live = view.LiveView(scene, tmp_path / "missing", port=0)
-    try:
-
-        def look(now: hqgs.Progress) -> None:
-            live(now)
-            facts.append(dict(live.viewer._facts))
-
-        done = hqgs.train(scene, config=tiny_config(method="hqgs"), progress=look)
-    finally:
-        live.viewer.close()
-    assert facts[0].keys() == {photo.name for photo in scene.train}
-    told = facts_of_photos(done.report)
-    assert all(rows.items() <= told[name].items() for name, rows in facts[0].items())
-    assert all(rows["size"] == "24 x 16" for rows in facts[0].values())
 
 
 class Looking:

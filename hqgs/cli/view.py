@@ -47,8 +47,7 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
 
     file = scene_file(options.source)
     check(options.port)
-    from hqgs.evaluation.photo_facts import facts_of_photos  # here: they load torch
-    from hqgs.model.gaussians import Gaussians
+    from hqgs.model.gaussians import Gaussians  # here: they load torch
     from hqgs.show.viewer.viewer import Viewer
 
     heed_endings()
@@ -60,7 +59,6 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
         tell_read(gaussians)
         viewer.set_scene(gaussians, _numbers(report, len(gaussians)))
         viewer.offer_trust()
-        viewer.set_facts({} if report is None else facts_of_photos(report))
         _tell(viewer.url, options.open)
         viewer.serve(seconds)
     except KeyboardInterrupt:
@@ -93,10 +91,6 @@ class LiveView:
         """Show the scene as it is, every two seconds, and answer the page after each step."""
         first, last = self._copied < 0, now.iteration == now.length
         due = self.viewer.watched and time.monotonic() - self._copied > EVERY
-        if first and now.diagnosis is not None:
-            from hqgs.evaluation.photo_facts import facts_of_diagnosis
-
-            self.viewer.set_facts(facts_of_diagnosis(now.diagnosis.photos))
         if first or last or due:
             rows = [("iteration", f"{now.iteration} of {now.length}"), ("Gaussians", f"{now.gaussians:,}")]
             if now.evaluated is not None and now.evaluated["psnr"] is not None:
@@ -106,16 +100,12 @@ class LiveView:
         self.viewer.pump()
 
     def stay(self) -> None:
-        """Go on showing the trained scene, and what the report says of its photos, until Ctrl-C."""
-        from hqgs.evaluation.photo_facts import facts_of_photos
+        """Go on showing the trained scene until Ctrl-C."""
         from hqgs.model.gaussians import Gaussians
 
-        report = RunFolder(self._out).report
         if self._copied < 0:  # a run that had ended already makes no step
             gaussians = Gaussians.load(self._out)
-            self.viewer.set_scene(gaussians, _numbers(report, len(gaussians)))
-        if report is not None:
-            self.viewer.set_facts(facts_of_photos(report))
+            self.viewer.set_scene(gaussians, _numbers(RunFolder(self._out).report, len(gaussians)))
         _tell(self.viewer.url, open_browser=False)
         try:
             self.viewer.serve()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hqgs.evaluation.records import LearnedRecord
+from hqgs.diagnosis.photo import PhotoDiagnosis
+from hqgs.evaluation.records import LearnedRecord, PhotoRecord
 from hqgs.evaluation.verdict import overdone
 from hqgs.training.methods.cameras import LearnedCamera
 from hqgs.training.rules import MOST_ITERATIONS
@@ -78,4 +79,18 @@ def learned_record(learned: LearnedCamera) -> LearnedRecord:
         "gains": learned.gains.tolist(),
         "vignetting": learned.vignetting.tolist(),
         "response": learned.response.tolist(),
+    }
+
+
+def photo_record(found: PhotoDiagnosis) -> PhotoRecord:
+    """The diagnosis of a photo as the report keeps it."""
+    return {
+        "name": found.name,
+        "width": found.width,
+        "height": found.height,
+        "blur": None if found.blur is None else found.blur.kind,
+        "blur_px": None if found.blur is None else found.blur.amount,
+        "noise": found.noise,
+        "jpeg_quality": found.jpeg.quality,
+        "enlarged": found.enlargement.factor,
     }

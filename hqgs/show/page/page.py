@@ -18,11 +18,19 @@ from PIL import Image
 from hqgs.base.evenly import evenly
 from hqgs.base.files import write_text
 from hqgs.base.left_out import CORRECTION, LeftOutRecord
+from hqgs.diagnosis.photo import PhotoDiagnosis
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.constants import MOST_CAMERAS
 from hqgs.evaluation.held_out import RenderedView, names_of
-from hqgs.evaluation.photo_facts import learned_words, photo_record, photo_words
-from hqgs.evaluation.records import HistoryEntry, Json, PlanRowRecord, Report, ViewMetricValues, alike
+from hqgs.evaluation.records import (
+    HistoryEntry,
+    Json,
+    LearnedRecord,
+    PlanRowRecord,
+    Report,
+    ViewMetricValues,
+    alike,
+)
 from hqgs.evaluation.verdict import judged_by, told, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
@@ -97,7 +105,7 @@ def page_text(page: Page) -> str:
         for name, unit, key, color in CHARTS
     ]
     measured_some = [h["views"] for h in history if "views" in h]
-    learned = [learned_words(record) for record in report["learned"]]
+    learned = [_learned(record) for record in report["learned"]]
     diagnosis = page.diagnosis
     return filled(
         "report.html.j2",
@@ -114,9 +122,7 @@ def page_text(page: Page) -> str:
         charts=charts,
         measured_on=max(measured_some, default=0),
         parts=[] if diagnosis is None else diagnosis.parts,
-        photos=[]
-        if diagnosis is None
-        else [_row(p.name, photo_words(photo_record(p))) for p in diagnosis.photos],
+        photos=[] if diagnosis is None else [_photo(found) for found in diagnosis.photos],
         learned=[
             words | {"photo": record["name"]}
             for record, words in zip(report["learned"], learned, strict=True)
@@ -230,8 +236,33 @@ def jpeg(picture: Image.Image, side: int = PAIR_SIDE) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
 
 
-def _row(name: str, words: dict[str, str]) -> tuple[str, ...]:
-    return name, *words.values()
+def _photo(found: PhotoDiagnosis) -> tuple[str, ...]:
+    """Name, size and faults of a photo."""
+    blur, quality, factor = found.blur, found.jpeg.quality, found.enlargement.factor
+    return (
+        found.name,
+        f"{found.width} x {found.height}",
+        "unknown" if blur is None else f"{blur.kind}, {blur.amount:.2f} px",
+        "unknown" if found.noise is None else f"{found.noise:.1f} levels",
+        "not visible" if quality is None else f"{quality}",
+        "no" if factor == 1 else f"x{factor}",
+    )
+
+
+def _learned(record: LearnedRecord) -> dict[str, str]:
+    """Shake, focus and exposure, by name, for people."""
+    stops = np.log2(record["gains"])
+    rgb = {name: f"{value:+.2f}" for name, value in zip("RGB", stops - stops.mean(), strict=True)}
+    shake = f"{record['shake_px']:.1f} px" if record["shake_px"] else "still"
+    focus = f"{record['defocus_px']:.1f} px" if record["defocus_px"] else "sharp"
+    if record["focus"] is not None:
+        focus += f", sharp at {record['focus']:.2g} of the median depth"
+    words = {"shake": shake, "out of focus": focus, "exposure, stops": f"{stops.mean():+.2f}", **rgb}
+    if (fall := sum(record.get("vignetting", [0.0]))) != 0:
+        words["vignetting"] = f"{np.expm1(-fall):+.0%} light in the corners"
+    if (bends := np.abs(record.get("response", [[0.0]]))).any():
+        words["response curve"] = f"slope up to {bends.sum(0).max():.0%} off the mean"
+    return words
 
 
 def _plan_row(row: PlanRowRecord) -> tuple[str, ...]:

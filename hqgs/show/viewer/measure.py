@@ -1,4 +1,4 @@
-"""How long things are: a bar in the picture, and the distance of two clicked points, with its error."""
+"""How long things are: the distance of two clicked points, with its error."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 from hqgs.scene.paths import view_matrix
 from hqgs.scene.scene import Camera
 from hqgs.scene.world import World
 from hqgs.show.frames import Activated
-from hqgs.show.viewer.pictures import Picture
 
 CLICKED = 3  # px a side, of the little picture around a click
 CLICK_ERROR = 1e-3  # radians: what a click is off
@@ -69,52 +67,18 @@ def told_points(a: Point, b: Point, world: World) -> str:
     return "--distance " + " ".join(",".join(f"{x:.9g}" for x in end) for end in ends) + " METRES"
 
 
-def with_bar(picture: Picture, camera: Camera, depth: float, world: World) -> Picture:
-    """The picture with a bar that is as long as it says at that depth (world units)."""
-    margin, thick, high = 16, 4, 16  # px
-    longest = 0.25 * picture.shape[1] * depth / camera.K[0, 0] * world.unit
-    if not 0 < longest < math.inf:
-        return picture
-    power = 10.0 ** math.floor(math.log10(longest))
-    length = next(step * power for step in (5, 2, 1) if step * power <= longest)
-    pixels = length / world.unit / depth * camera.K[0, 0]
-    shown = Image.fromarray(picture)
-    draw = ImageDraw.Draw(shown)
-    x, y = margin, picture.shape[0] - margin
-    draw.rectangle((x - 1, y - thick - 1, x + pixels + 1, y + 1), fill=(0, 0, 0))
-    draw.rectangle((x, y - thick, x + pixels, y), fill=(255, 255, 255))
-    text = f"{length:g} {'m' if world.metres else 'units'}"
-    place, font = (x, y - thick - high - 6), ImageFont.load_default(high)
-    draw.text(place, text, fill=(255, 255, 255), font=font, stroke_width=2, stroke_fill=(0, 0, 0))
-    return np.array(shown)
-
-
 class Ruler:
     """The folder "Measure" of the page."""
 
-    def __init__(
-        self, server: Any, scene: Callable[[], Activated | None], refresh: Callable[[], None]
-    ) -> None:
-        self._server, self._scene, self._refresh = server, scene, refresh
+    def __init__(self, server: Any, scene: Callable[[], Activated | None]) -> None:
+        self._server, self._scene = server, scene
         self.world: World = World()
         self._points: list[Point] = []
         self._marks: list[Any] = []
         with server.gui.add_folder("Measure", expand_by_default=False):
             self._on = server.gui.add_checkbox("Click two points", False)
-            self._bar = server.gui.add_checkbox("Scale bar", False, hint="as long as it says in the middle")
             self.told: Any = server.gui.add_markdown("")
         self._on.on_update(self._switch)
-        self._bar.on_update(lambda _: refresh())
-
-    def over(self, picture: Picture, camera: Camera) -> Picture:
-        """The picture with the bar, where that is asked for."""
-        scene = self._scene()
-        if not self._bar.value or scene is None:
-            return picture
-        point = picked(scene, camera.center.tolist(), camera.viewmat[2, :3].tolist())
-        if point is None:
-            return picture
-        return with_bar(picture, camera, float(np.linalg.norm(point.at - camera.center)), self.world)
 
     def clicked(self, event: Any) -> None:
         """A point more; of two the distance is told."""

@@ -8,7 +8,7 @@ import shlex
 import threading
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -93,7 +93,6 @@ class Viewer:
         self._clients: dict[int, Client] = {}
         self._keys: list[Camera] = []
         self._stats = ""
-        self._facts: Mapping[str, Mapping[str, str]] = {}
         self._server = start_server(port, title)
         self.url: str = f"http://127.0.0.1:{self._server.get_port()}"
         self._up = np.array(UP) if known is None else known.up
@@ -123,11 +122,6 @@ class Viewer:
                 client.stale = True
         self._stats = _table(stats)
         self._numbers.content = self._stats
-
-    def set_facts(self, facts: Mapping[str, Mapping[str, str]]) -> None:
-        """What the page says of each photo, by its name, where it is chosen: rows of names and values."""
-        self._facts = facts
-        self._tell_photo()
 
     def offer_trust(self) -> None:
         """Let pages show it, of a scene that stays as it is, where the run has photos."""
@@ -168,7 +162,6 @@ class Viewer:
             picture = shown(self._scene, camera, self._show.value, self._trust)
             client.took(time.perf_counter() - started, camera.height, sharp)
             picture = self._compared(picture, camera)
-            picture = self.ruler.over(picture, camera) if sharp else picture
         except ValueError:  # a camera that no scene can be seen from, such as 1e300 away
             return
         with warnings.catch_warnings():  # of viser, where the page was closed meanwhile
@@ -230,7 +223,6 @@ class Viewer:
         with gui.add_folder("Photos", visible=bool(self._views)):
             names = [v.name for v in sorted(self._views.values(), key=lambda v: not v.held_out)]
             self._photo = gui.add_dropdown("Camera", (FREE, *names))
-            self._of_photo = gui.add_markdown("")
             self._split = gui.add_slider("Photo | render", 0.0, 1.0, 0.01, 0.5)
             self._cameras_box = gui.add_checkbox("Show cameras", False)
         with gui.add_folder("Camera path", expand_by_default=False):
@@ -238,7 +230,7 @@ class Viewer:
             self._length = gui.add_slider("Seconds", 1, 60, 1, 8)
             play, keep = gui.add_button("Play"), gui.add_button("Save")
             self._told = gui.add_markdown("No view yet.")
-        self.ruler: Ruler = Ruler(self._server, lambda: self._scene, self._refresh)
+        self.ruler: Ruler = Ruler(self._server, lambda: self._scene)
         for handle in (self._show, self._detail, self._split):
             handle.on_update(self._refresh)
         self._photo.on_update(self._go_to_photo)
@@ -277,16 +269,11 @@ class Viewer:
             made.append(handle)
         return made
 
-    def _tell_photo(self) -> None:
-        rows = self._facts.get(self._photo.value, {}).items()
-        self._of_photo.content = _table([*rows]) if rows else ""
-
     def _toggle_cameras(self, _: object) -> None:
         for handle in self._frustums:
             handle.visible = self._cameras_box.value
 
     def _go_to_photo(self, _: object) -> None:
-        self._tell_photo()
         view = self._views.get(self._photo.value)
         if view is not None:
             for client in list(self._clients.values()):
