@@ -72,9 +72,9 @@ class FakeRun:
 
     def held_out(self) -> list[RenderedView]:
         assert self.iteration == self.length == trial.STEPS
-        growth = self.plan.settings.densify
+        growth, due = self.plan.settings.densify, self.plan.settings.due
         pixels = sum(view.camera.width * view.camera.height for view in self.scene.train)
-        level = growth.max_gaussians / pixels if growth.start < growth.stop else 1 / GAUSSIAN
+        level = growth.max_gaussians / pixels if due.start < due.stop else 1 / GAUSSIAN
         rng = np.random.default_rng(0)
         found = []
         for view in self.scene.test:
