@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hqgs.base.options import Factor, Number
+from hqgs.base.options import Number, given
 from hqgs.cli.errors import fail
 from hqgs.cli.judge import check_source
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import check_above, measured_scene, tell_read
+from hqgs.cli.scenes import Measured, check_above, measured_scene, tell_read
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
@@ -21,19 +21,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clean:
+class Clean(Measured):
     """Options of `hqgs clean`."""
 
-    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """The folder of a run, or a scene file of this or another program."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """The scene file to write; it is written only if renders of held-out photos improve."""
-    photos: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
-    """Photos with their cameras, in the frame of the scene file (those of the run)."""
-    downscale: Factor = None
-    """Divide width and height of the photos of --photos by F."""
-    test_every: Number = None
-    """Hold out every N-th photo of --photos (as the run did; else 8, unless the scene has a split)."""
     steps: Number = None
     """Number of training views to render (600)."""
 
@@ -56,14 +48,12 @@ def run(options: Clean) -> int:
     from hqgs.model.gaussians import Gaussians
     from hqgs.training.cleaning import CLEANING_STEPS, check_steps, clean, held_out_psnrs
 
-    steps = CLEANING_STEPS if options.steps is None else options.steps
+    steps = given(options.steps, CLEANING_STEPS)
     check_steps(steps)
     run = RunFolder.open(options.source)
     background = run.background
     with LoadingScreen() as screen:
-        scene = measured_scene(
-            run, options.source, options.photos, options.downscale, options.test_every, screen
-        )
+        scene = measured_scene(run, options, screen)
         gaussians = Gaussians.load(source)
         done = clean(gaussians.in_world(scene.world), scene, steps, background, screen.stage)
     cleaned = done.gaussians.in_world(gaussians.world)  # in the frame of the source

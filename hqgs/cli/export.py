@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hqgs.base.options import Factor, Flag, values
+from hqgs.base.options import Factor, Flag, Number, Unsaid, values
 from hqgs.base.text import markdown_table
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Photos, check_above, load, measured_scene, ready, tell_read
+from hqgs.cli.scenes import Measured, Photos, check_above, load, measured_scene, ready, tell_read
 from hqgs.model.formats.files import FORMATS, WRITTEN, format_of, scene_file
 from hqgs.scene.names import is_room
 from hqgs.show.export_options import ExportOptions
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hqgs.scene.scene import Scene
     from hqgs.show.export import Export
 
-DEFAULTS = ExportOptions("ply")
+OF_FILES = ("sh_degree", "sh_bits", "spz_version", "band_tolerance")  # options that say how a file is written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,14 +39,14 @@ class ExportScene:
             metavar="FORMAT", help_behavior_hint="", help=f"{', '.join(WRITTEN)} (by the suffix of FILE)."
         ),
     ] = None
-    sh_degree: Annotated[int, tyro.conf.arg(metavar="D")] = DEFAULTS.sh_degree
-    """Highest degree of the spherical harmonics; lower if the scene does not need it."""
-    sh_bits: Annotated[tuple[int, int], values("B B", "two whole numbers", int, int)] = DEFAULTS.sh_bits
-    """SPZ: bits of the harmonics of degree 1, and of degrees 2 and 3."""
-    spz_version: Annotated[int, tyro.conf.arg(metavar="V")] = DEFAULTS.spz_version
-    """SPZ: version 3, which most programs read, or 4, which is smaller and which newer programs need."""
-    band_tolerance: Annotated[float, tyro.conf.arg(metavar="T")] = DEFAULTS.band_tolerance
-    """Leave out harmonics that change colours by at most this; white is 1."""
+    sh_degree: Number = None
+    """Highest degree of the spherical harmonics (3); lower if the scene does not need it."""
+    sh_bits: Annotated[tuple[int, int] | None, values("B B", "two whole numbers", int, int), Unsaid] = None
+    """SPZ: bits of the harmonics of degree 1, and of degrees 2 and 3 (8 8)."""
+    spz_version: Number = None
+    """SPZ: version 3, which most programs read, or 4, which is smaller and which newer programs need (3)."""
+    band_tolerance: Factor = None
+    """Leave out harmonics that change colours by at most this; white is 1 (0.004)."""
     trust: Flag = False
     """Also write the error of each Gaussian, measured by the photos of the run: PLY, glTF."""
     scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
@@ -60,13 +60,8 @@ OPTIONS = ExportScene
 
 def run(args: ExportScene) -> int:
     """Export what `args` say and print tables; return the exit code (0 done, 1 failed, 2 bad input)."""
-    options = ExportOptions(
-        format=format_of(args.out, args.format, written=True),
-        sh_degree=args.sh_degree,
-        band_tolerance=args.band_tolerance,
-        sh_bits=args.sh_bits,
-        spz_version=args.spz_version,
-    )
+    said = {name: value for name in OF_FILES if (value := getattr(args, name)) is not None}
+    options = ExportOptions(format_of(args.out, args.format, written=True), **said)
     _check_together(args, options.format)
     source = scene_file(args.source)
     check_above(args.out)
@@ -119,7 +114,7 @@ def _check_together(args: ExportScene, format: str) -> None:
     if args.downscale is not None and args.scene is None:
         raise ValueError("--downscale is for the photos of --scene: give --scene too")
     for name in ("sh_bits", "spz_version"):
-        if format != "spz" and getattr(args, name) != getattr(DEFAULTS, name):
+        if format != "spz" and getattr(args, name) is not None:
             asked = f"--out {args.out}" if args.format is None else "--format"
             raise ValueError(f"--{name.replace('_', '-')} is for spz, and {asked} says {format}")
 
@@ -131,7 +126,8 @@ def _held_out_photos(run: RunFolder, args: ExportScene) -> Scene:
     with LoadingScreen() as screen:
         if is_room(photos):
             return load(Photos(scene=photos, downscale=args.downscale), screen)
-        return measured_scene(run, args.source, photos, args.downscale, None, screen)
+        asked = Measured(source=args.source, photos=photos, downscale=args.downscale)
+        return measured_scene(run, asked, screen)
 
 
 def _table(

@@ -11,9 +11,9 @@ import tyro
 
 from hqgs import __version__
 from hqgs.base.files import CONFIG, write_json
-from hqgs.base.options import Color, Factor, Number
+from hqgs.base.options import Color
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import check_background, check_out_folder, measured_scene, ready
+from hqgs.cli.scenes import Measured, check_background, check_out_folder, measured_scene, ready
 from hqgs.evaluation.judge_words import told
 from hqgs.evaluation.verdict import judged_by
 
@@ -26,21 +26,13 @@ META = "meta.json"  # of a SOG scene that was unpacked
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judge:
+class Judge(Measured):
     """Options of `hqgs judge`."""
 
-    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """A scene file of this or another program, or the folder of a run."""
-    photos: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
-    """Photos with their cameras, in the frame of the scene file (those of the run)."""
     against: Annotated[Path | None, tyro.conf.arg(metavar="OTHER", help_behavior_hint="")] = None
     """Another scene of the same photos to compare with, or its judge.json."""
     views: Annotated[str, tyro.conf.arg(metavar="WHICH")] = "test"
     """Photos to measure on: test (held out), train, all, or names separated by commas."""
-    test_every: Number = None
-    """Hold out every N-th photo of --photos (as the run did; else 8, unless the scene has a split)."""
-    downscale: Factor = None
-    """Divide width and height of the photos by F (the longer side becomes 1600 px at most)."""
     background: Color = None
     """Background colour R G B; 1 is white (that of the run, or black)."""
     fit_cameras: bool = False
@@ -75,9 +67,7 @@ def run(options: Judge) -> int:
     elif options.against is not None:
         other = scene_file(options.against)
     with LoadingScreen() as screen:
-        scene = measured_scene(
-            run, options.source, options.photos, options.downscale, options.test_every, screen
-        )
+        scene = measured_scene(run, options, screen)
         views = chosen_views(scene, options.views)
         background = run.background if options.background is None else options.background
         protocol = protocol_of(scene, options.views, views, background)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hqgs.base.options import Color, Factor, Number, Size, Unsaid, Vector, choice
+from hqgs.base.options import Color, Factor, Number, Size, Unsaid, Vector, choice, given
 from hqgs.base.text import some
 from hqgs.cli.scenes import check_above, check_background, tell_read
 from hqgs.evaluation.run_folder import RunFolder
@@ -37,9 +37,9 @@ class Render:
     """PATH.mp4, PATH.gif, PATH.png, or a folder for pictures."""
     views: Annotated[str | None, tyro.conf.arg(metavar="WHICH", help_behavior_hint="")] = None
     """Render the photos' views instead of a path: train, test, all, or names separated by commas."""
-    path: Annotated[str, tyro.conf.arg(metavar="KIND")] = PATHS[0]
-    """cameras (a smooth path through the training cameras, with cuts at large gaps), orbit, or the JSON file
-    of a camera path by the viewer or nerfstudio. A scene file without cameras gets an orbit."""
+    path: Annotated[str | None, tyro.conf.arg(metavar="KIND"), Unsaid] = None
+    """cameras (the default: a smooth path through the training cameras, with cuts at large gaps), orbit, or
+    the JSON file of a camera path by the viewer or nerfstudio. A scene file without cameras gets an orbit."""
     frames: Number = None
     """Number of frames, for cameras and orbit (240)."""
     fps: Factor = None
@@ -79,7 +79,7 @@ def run(options: Render) -> int:
         cameras = [with_size(camera, *size) for camera in cameras]
     if out.suffix.lower() == ".png" and options.views is None:
         cameras = cameras[:1]
-    fps = rate if options.fps is None else options.fps
+    fps = given(options.fps, rate)
     check_frames(cameras, out, fps, options.show)
     look = None if options.look is None else look_of(run.folder, options.look)
     trust = _trust(options, gaussians, run) if options.show == "trust" else None  # it may take minutes
@@ -90,7 +90,7 @@ def run(options: Render) -> int:
         out,
         fps=fps,
         show=options.show,
-        background=run.background if options.background is None else options.background,
+        background=given(options.background, run.background),
         names=names,
         progress=_progress if sys.stderr.isatty() else None,
         trust=trust,
@@ -106,10 +106,8 @@ def run(options: Render) -> int:
 
 def _check(options: Render, run: RunFolder) -> None:
     """What the options alone tell. ValueError."""
-    of_paths = {"path": options.path != PATHS[0], "frames": options.frames is not None}
-    of_paths["up"] = options.up is not None
-    for name, given in of_paths.items():
-        if options.views is not None and given:
+    for name in ("path", "frames", "up"):
+        if options.views is not None and getattr(options, name) is not None:
             raise ValueError(
                 f"--{name} is for paths, and --views uses the photos' cameras: give only one of them"
             )
@@ -141,9 +139,9 @@ def _cameras(
     from hqgs.scene.camera_files import load_path, moved, picked
     from hqgs.scene.paths import UP, camera_path
 
-    source, views, path, frames = options.source, options.views, options.path, options.frames
+    source, views, path, frames = options.source, options.views, options.path or PATHS[0], options.frames
     known = gaussians.along(run.cameras)
-    count = FRAMES if frames is None else frames
+    count = given(frames, FRAMES)
     if views is not None:
         if known is None:
             raise ValueError(f"{source} has no cameras.json, so its views are unknown: use --path orbit")
@@ -165,7 +163,7 @@ def _cameras(
         raise ValueError(
             "--up is for an orbit (--path orbit); a path through the cameras is level as they are"
         )
-    up = known.up if options.up is None else options.up
+    up = given(options.up, known.up)
     made = orbit(known.train, count, up=up) if path == "orbit" else camera_path(known.train, count, cuts=True)
     return None, made, FPS
 

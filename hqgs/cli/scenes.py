@@ -17,7 +17,7 @@ import tyro
 
 from hqgs.base.files import CHECKPOINT
 from hqgs.base.interrupt import ENDINGS
-from hqgs.base.options import Factor, given
+from hqgs.base.options import Factor, Number, Unsaid, given
 from hqgs.base.text import some
 from hqgs.cli.errors import fail
 from hqgs.scene.names import existing_folder, is_room
@@ -42,6 +42,20 @@ class Photos:
     a built-in room."""
     downscale: Factor = None
     """Divide width and height of the photos by F."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """A scene file, and the photos that it is measured on."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """The folder of a run, or a scene file of this or another program."""
+    photos: Annotated[str | None, tyro.conf.arg(metavar="SCENE"), Unsaid] = None
+    """Photos with their cameras, in the frame of the scene file (those of the run)."""
+    downscale: Factor = None
+    """Divide width and height of the photos of --photos by F (longer sides become 1600 px at most)."""
+    test_every: Number = None
+    """Hold out every N-th photo of --photos (as the run did; else 8, unless the scene has a split)."""
 
 
 def ready(scene: str) -> None:
@@ -98,30 +112,24 @@ def check_background(background: Sequence[float]) -> None:
         raise ValueError(f"--background is {given}, wanted three numbers in 0..1; 1 is white")
 
 
-def measured_scene(
-    run: RunFolder,
-    source: Path,
-    photos: str | None,
-    downscale: float | None,
-    test_every: int | None,
-    screen: LoadingScreen,
-) -> Scene:
-    """The photos that a scene file is measured with: `photos`, or those that its run was trained on.
+def measured_scene(run: RunFolder, asked: Measured, screen: LoadingScreen) -> Scene:
+    """The photos that a scene file is measured with: those that are named, or those of its run.
 
     Where `test_every` is not said, those are held out that the run held out.
     """
+    photos, source, test_every = asked.photos, asked.source, asked.test_every
     from hqgs.evaluation.run_folder import check_same  # here: they load torch
     from hqgs.scene.load import formats_of, scene_folder
     from hqgs.scene.source import finding, load
 
     if photos is None:
-        if downscale is not None or test_every is not None:
+        if asked.downscale is not None or test_every is not None:
             raise ValueError(
                 f"{source} is measured on the photos of its run: --downscale and --test-every need --photos"
             )
         return run.photos(screen.stage)
     bare = film_at(photos) is not None or not (
-        is_room(photos) or formats_of(scene_folder(photos)[0], downscale or 1.0)
+        is_room(photos) or formats_of(scene_folder(photos)[0], asked.downscale or 1.0)
     )
     if bare and not run.config:
         raise ValueError(
@@ -130,8 +138,8 @@ def measured_scene(
         )
     scene = load(
         photos,
-        downscale=downscale,
-        longest=longest_side("standard", downscale),
+        downscale=asked.downscale,
+        longest=longest_side("standard", asked.downscale),
         test_every=given(test_every, run.loaded.get("test_every")),
         skip_unreadable=False,
         points=False,

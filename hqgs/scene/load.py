@@ -51,31 +51,16 @@ class FolderCall(LoadOptions):
 
 @called_with(FolderCall)
 def load_scene(asked: FolderCall) -> Scene:
-    """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
+    """The scene of a folder; `hqgs.load` says what the options are.
 
     The format is recognised in this order: a COLMAP model with photos (`sparse/0`, `sparse`, or the folder
-    itself; `images`), `transforms.json` or `transforms_train.json`, `poses_bounds.npy`. Distorted photos are
-    undistorted, and scaled down by `downscale` (>= 1) by area; where a COLMAP or LLFF
-    scene has `images_N` for N = `downscale`, those photos are taken as they are.
+    itself; `images`), `transforms.json` or `transforms_train.json`, `poses_bounds.npy`, photos alone, whose
+    cameras and points `keep_sfm` keeps for the next call. Where a COLMAP or LLFF scene has `images_N` for
+    N = `downscale`, those photos are taken as they are.
 
-    Views are sorted by name; every `test_every`-th one (index % test_every == 0) is a test view, 0 means
-    none. A Blender pair of files names its own test views; a marker file `hold=N` stands for test_every = N,
-    counted over the photos in the folder. `Scene.notes` says which rule and which files were used.
-
-    A folder that `hqgs degrade` wrote names its held-out photos itself. Its small photos go into `View.low`
-    at downscale 1, the only one at which they stand for `View.image`.
-
-    A folder that holds photos alone gets its cameras and points from them (`read_photos`). `keep_sfm` is
-    a folder for that reconstruction, which the next call takes from there. `on_stage` hears what takes
-    long. Half a COLMAP model beside the photos is an error, unless `sfm` says that they are to be used alone.
-
-    `longest` bounds the longer side of the photos, px: they are scaled down further where it is larger, or
-    where all of them would take more than MOST_BYTES of memory. `coarse`: whether cameras of photos alone
-    may be found coarsely (`run_colmap`); None: where `longest` makes the photos small.
-
-    With `skip_unreadable` photos that cannot be decoded (or whose mask or small photo cannot), and those of
-    another shape than their camera, are left out, as long as at least half of the training photos remain, and
-    of the held-out ones; `Scene.notes` names them. The others are training or test views as before.
+    A folder of `hqgs degrade` and a Blender pair of files name the held-out photos themselves; a marker file
+    `hold=N` stands for test_every = N, counted over the photos in the folder. Small photos of `hqgs degrade`
+    go into `View.low` at downscale 1, the only one at which they stand for `View.image`.
 
     Raises FileNotFoundError for a missing folder or photo, ValueError for anything else that is wrong.
     """
