@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.scene.capture import Capture, Photo
-from hqgs.scene.faces import CUBE, WIDE, Face, face_name, faces_of
+from hqgs.scene.faces import CUBE, WIDE, face_name, faces_of
+from hqgs.scene.geometry import in_frame
+from hqgs.scene.scene import Camera
 
 
 def with_faces(capture: Capture) -> Capture:
@@ -30,7 +32,8 @@ def with_faces(capture: Capture) -> Capture:
             viewmat[:3] = face.rotation @ photo.viewmat[:3]
             photos.append(replace(photo, name=name, viewmat=viewmat, face=face, film=None))
             if rows is not None:
-                seen[name] = rows[_shown(face, viewmat, capture.points[rows])]
+                camera = Camera(face.width, face.height, face.K, viewmat)
+                seen[name] = rows[in_frame(camera, capture.points[rows].astype(np.float64))]
     tests = capture.test_names
     most = max(len(found) for found in faces.values())
     note = (
@@ -45,11 +48,3 @@ def with_faces(capture: Capture) -> Capture:
         near_far={own: depths for name, depths in capture.near_far.items() for own in called[name]},
         notes=[*capture.notes, note],
     )
-
-
-def _shown(face: Face, viewmat: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which points [P, 3] lie before a face and within its picture."""
-    pixels = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ face.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = pixels[:, :2] / pixels[:, 2:]
-    return (pixels[:, 2] > 0) & ((at >= 0) & (at <= (face.width, face.height))).all(-1)
