@@ -13,8 +13,9 @@ from hqgs.photos.exif import read_exif
 from hqgs.photos.files import is_cut_out
 from hqgs.scene.capture import Capture, Photo
 from hqgs.scene.constants import GPS_LEAST, ONE_PLACE, SHOWN
+from hqgs.scene.geometry import project, within
 from hqgs.scene.georeference import Georeference, georeference
-from hqgs.scene.scene import strays
+from hqgs.scene.scene import Camera, strays
 from hqgs.scene.world import world_for
 
 FAR_OFF = 20.0  # median distances: from here on a camera is asked what of the points it shows
@@ -139,13 +140,9 @@ def _centers(capture: Capture) -> NDArray[np.float64]:
 
 def _shows(photo: Photo, points: NDArray[np.float64]) -> bool:
     """Whether points [P, 3] are in a photo, as more than a dot. What a lens bends does not matter here."""
-    rows = points @ photo.viewmat[:3, :3].T + photo.viewmat[:3, 3]
-    rows = rows[rows[:, 2] > 0]
-    if not len(rows):
-        return False
-    K = photo.camera.calibration_matrix() if photo.face is None else photo.face.K
     part = photo.face or photo.camera
-    pixels = rows @ K.T
-    shares = pixels[:, :2] / pixels[:, 2:] / (part.width, part.height)
-    inside = shares[((shares >= 0) & (shares <= 1)).all(1)]
-    return len(inside) > 0 and float(np.ptp(inside, axis=0).max()) > SHOWN
+    K = photo.camera.calibration_matrix() if photo.face is None else photo.face.K
+    camera = Camera(part.width, part.height, K, photo.viewmat)
+    pixels, depths = project(camera, points)
+    shares = pixels[within(camera, pixels, depths)] / (part.width, part.height)
+    return len(shares) > 0 and float(np.ptp(shares, axis=0).max()) > SHOWN
