@@ -203,8 +203,8 @@ def test_bad_scene_arguments() -> None:
         look_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 
 
-def views_of(width: int, height: int, count: int) -> list[View]:
-    cameras = embedded_cameras(width, height, count)
+def views_of(width: int, height: int, count: int, first: int | None = None) -> list[View]:
+    cameras = embedded_cameras(width, height, count)[:first]
     return [View(f"v{k}.png", c, render_view(c)) for k, c in enumerate(cameras)]
 
 
