@@ -9,18 +9,24 @@ import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from fixtures_scenes import make_truth, write_transforms
+from PIL import Image
 from tiny_scene import tiny_scene
 
 import hqgs
 from hqgs.base.files import CHECKPOINT, lock_folder
+from hqgs.base.stages import Stage
 from hqgs.cli import main as cli
+from hqgs.cli import progress
+from hqgs.cli.progress import LoadingScreen, TrainingScreen
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source
+from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, SfmReport
 from hqgs.training.methods.base import ThreeDGS
 
@@ -409,3 +415,127 @@ def test_info_of_a_run_that_was_killed(
     (tmp_path / "checkpoint.safetensors").touch()
     assert call("info", tmp_path) == 0
     assert f"an unfinished run: {told.format(out=tmp_path)}" in capsys.readouterr().out
+
+
+# --- `hqgs sfm`, `diagnose` and `info` on photos alone, as a user has them
+
+
+@pytest.fixture
+def folder(photos: list[np.ndarray], tmp_path: Path) -> Path:
+    """Photos and a text that is none."""
+    path = tmp_path / "photos"
+    path.mkdir()
+    for k, image in enumerate(photos):
+        Image.fromarray(image).save(path / f"{k}.{'webp' if k % 2 else 'png'}", lossless=True)
+    (path / "zz.png").write_text("a text")
+    return path
+
+
+def test_sfm_writes_a_folder_that_trains(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "scene"
+    (out / ".sfm").mkdir(parents=True)  # of a call that was stopped
+    assert call("sfm", folder, "--out", out) == 0
+    printed = capsys.readouterr().out
+    assert "9 of 9 registered" in printed
+    assert "zz.png (no picture)" in printed
+    assert sorted(path.name for path in out.iterdir()) == ["images", "sparse"]
+    assert sorted(path.name for path in (out / "images").iterdir())[:2] == ["0.png", "1.webp.jpg"]
+    scene = load_scene(out)
+    assert scene.source == "colmap"
+    assert len(scene.train) + len(scene.test) == 9
+    assert call("sfm", folder, "--out", out) == 2
+    assert "is not an empty folder" in capsys.readouterr().err
+
+
+def test_diagnose_and_info_need_no_cameras(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call("diagnose", folder, "--out", tmp_path / "d.json") == 0
+    assert "cannot be read (1): zz.png" in capsys.readouterr().out
+    assert len(json.loads((tmp_path / "d.json").read_text())["photos"]) == 9
+    assert call("info", folder) == 0
+    printed = capsys.readouterr().out
+    assert "9 photos of 192 x 144 px" in printed
+    assert "poses: none yet" in printed
+    assert call("info", tmp_path / "d.json") == 2
+
+
+# --- What the screen says of a run without a terminal: how long it takes, early and again and again
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: now[0])
+    return now
+
+
+def told(clock: list[float], step: float, count: int, length: int, every: int = 0) -> list[tuple[int, str]]:
+    """The lines of so many steps of `step` seconds each, with their iterations; evaluated `every` so many."""
+    screen, lines = TrainingScreen(), list[tuple[int, str]]()
+    screen.live = False
+    for k in range(1, count + 1):
+        clock[0] += step
+        done = {"psnr": 20.0, "ssim": 0.5, "views": 2} if every and k % every == 0 else None
+        screen.say = lambda text, k=k: lines.append((k, text))
+        now: Any = SimpleNamespace(
+            iteration=k, length=length, seconds=k * step, gaussians=9, loss=0.1, evaluated=done
+        )
+        screen(now)
+    return lines
+
+
+def test_fast_steps_are_estimated_after_35(clock: list[float]) -> None:
+    ((iteration, text),) = told(clock, 0.05, 100, 1000)
+    assert iteration == 36
+    assert text.startswith("1,000 iterations, 20.0 per second now: training takes about 48 s to 2 min")
+
+
+def test_slow_steps_are_estimated_after_a_few(clock: list[float]) -> None:
+    iteration, text = told(clock, 2.0, 12, 30_000)[0]
+    assert iteration == 9  # five to warm up, and five seconds
+    assert "about 16.7 h to 50.0 h" in text
+
+
+def test_a_line_each_minute_with_what_is_left(clock: list[float]) -> None:
+    lines = told(clock, 1.0, 200, 1000)[1:]
+    assert [iteration for iteration, _ in lines] == [62, 123, 184]
+    assert lines[0][1] == "iteration 62 of 1000: 9 Gaussians, 62 s, loss 0.100; about 16 min left"
+
+
+def test_evaluations_say_on_how_many_views_and_what_is_left(clock: list[float]) -> None:
+    lines = told(clock, 1.0, 100, 100, every=50)[1:]
+    assert lines == [
+        (
+            50,
+            "iteration 50: 9 Gaussians, 50 s, 2 of the held-out views 20.00 dB, SSIM 0.5000; about 50 s left",
+        ),
+        (100, "iteration 100: 9 Gaussians, 100 s, 2 of the held-out views 20.00 dB, SSIM 0.5000"),
+    ]
+
+
+def test_before_the_first_step_no_silence_lasts(clock: list[float]) -> None:
+    """A line every few seconds while something is done, of whatever it is; none where it is quick."""
+    lines = list[tuple[float, str]]()
+    screen = LoadingScreen()
+    screen.live = False
+    say = screen.say
+    screen.say = lambda text: (lines.append((clock[0] - 100, text)), say(text))[0]
+    screen.stage(Stage("COLMAP", 0, 9, "It takes long."))
+    for what, step in (("photos read", 0.1), ("COLMAP: features", 2.0), ("COLMAP: matches", 0.1)):
+        for k in range(1, 10):
+            clock[0] += step
+            screen.stage(Stage(what, k, 9))
+    clock[0] += 10
+    screen.stage(Stage("frames", 4, 0))
+    told = [(round(when), text) for when, text in lines]
+    assert told == [
+        (0, "It takes long."),
+        (7, "COLMAP: features: 3 of 9"),
+        (13, "COLMAP: features: 6 of 9"),
+        (19, "COLMAP: features: 9 of 9"),
+        (30, "frames: 4"),
+    ]
+    assert screen.colmap_seconds == pytest.approx(18.9)

@@ -1,4 +1,4 @@
-"""Points between those of a reconstruction, along edges."""
+"""Points between those of a reconstruction: along edges, found back in photos, where depths agree."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from test_learned_cameras import textured_scene
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.model.consistency import SmallPhoto
+import hqgs
+from hqgs.model.consistency import Agreement, SmallPhoto
 from hqgs.model.first_points import points_along_edges
 from hqgs.pipeline import run_to_end
+from hqgs.scene.geometry import project, unproject
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.config import HQGSConfig
 from hqgs.training.rules import PIXELS
@@ -180,3 +184,115 @@ def test_hqgs_starts_from_them_where_points_are_few(tmp_path: Path) -> None:
 def test_a_share_out_of_range_is_refused(share: float) -> None:
     with pytest.raises(ValueError, match=r"first_points is .*, wanted 0 to 1"):
         HQGSConfig(first_points=share)
+
+
+# --- First points that photos find back in each other
+
+
+SCENE = textured_scene(8, 96)  # a plane at depth 1
+
+
+def found(views: list[View], count: int = 800) -> tuple[np.ndarray, np.ndarray, float]:
+    assert SCENE.seen is not None
+    agreement = Agreement(views, SCENE.seen)
+    return points_along_edges(views, SCENE.points, SCENE.seen, count, 0, agreement, found_back=True)
+
+
+def off_the_plane(points: np.ndarray) -> np.ndarray:
+    camera = SCENE.train[0].camera
+    return np.abs((points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3])[:, 2] - 1)
+
+
+def test_they_lie_on_the_surface_and_are_the_same_for_any_number_of_threads() -> None:
+    points, colors, agreed = found(SCENE.train)
+    assert points.dtype == np.float32
+    assert colors.shape == points.shape
+    assert 0.8 * 800 < len(points) <= 800
+    assert np.mean(off_the_plane(points) < 0.02) > 0.95
+    assert SCENE.seen is not None
+    agreement = Agreement(SCENE.train, SCENE.seen)
+    along = points_along_edges(SCENE.train, SCENE.points, SCENE.seen, 800, 0, agreement)
+    assert agreed == along[2]  # rules go by the share of the first look
+    for threads in (1, 3):
+        hqgs.set_num_threads(threads)
+        np.testing.assert_array_equal(found(SCENE.train)[0], points)
+
+
+def test_two_photos_are_enough_and_must_find_each_other() -> None:
+    two = SCENE.train[2:4]
+    points, _, agreed = found(two)
+    assert agreed == 0  # no two others
+    assert len(points) > 400
+    assert np.mean(off_the_plane(points) < 0.03) > 0.9
+    rng = np.random.default_rng(0)
+    noise = replace(two[1], image=rng.integers(0, 256, two[1].image.shape).astype(np.uint8))
+    # Of noise some patch looks alike at one of many depths by chance.
+    assert len(found([two[0], noise])[0]) < 300
+
+
+def test_photos_that_know_no_points_and_masks_are_left_alone() -> None:
+    mask = np.zeros(SCENE.train[0].image.shape[:2], bool)
+    assert len(found([replace(view, mask=mask) for view in SCENE.train])[0]) == 0
+    strangers = [replace(view, name=f"{view.name}?") for view in SCENE.train]
+    assert found(strangers)[0].shape == (0, 3)
+    assert len(found(SCENE.train, 0)[0]) == 0
+
+
+def test_photos_from_one_place_tell_no_depth() -> None:
+    assert SCENE.seen is not None
+    copies = [(k, view) for view in SCENE.train for k in range(3)]  # a burst at each place
+    views = [replace(view, name=f"{k} {view.name}") for k, view in copies]
+    seen = {f"{k} {view.name}": SCENE.seen[view.name] for k, view in copies}
+    agreement = Agreement(views, seen)
+    for most in (4, 8):
+        assert 3 not in {k // 3 for k in agreement.asked(9, most)}
+    assert len({k // 3 for k in agreement.asked(9)}) == 4
+    points, _, _ = points_along_edges(views, SCENE.points, seen, 1600, 0, agreement, found_back=True)
+    assert len(points) > 1000
+    assert np.mean(off_the_plane(points) < 0.02) > 0.97  # 0.56 where copies are asked
+
+    still = {str(k): seen[views[0].name] for k in range(6)}
+    one_place = [replace(views[0], name=name) for name in still]
+    assert not len(
+        points_along_edges(
+            one_place, SCENE.points, still, 800, 0, Agreement(one_place, still), found_back=True
+        )[0]
+    )
+
+
+# --- Depths that other photos agree with
+
+
+def test_the_surface_is_found_within_the_ranges() -> None:
+    scene = textured_scene(8, 96)
+    assert scene.seen is not None
+    views = scene.train
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(20, 76, (200, 2)).astype(np.float64) + 0.5
+    nearest = rng.uniform(0.6, 0.95, 200)  # the plane is at depth 1
+    ranges = np.stack([nearest, rng.uniform(1.05, 1.6, 200)], axis=1)
+    depths, agreed = Agreement(views, scene.seen).depths(3, pixels, ranges)
+    assert agreed.mean() > 0.9
+    points = unproject(views[3].camera, pixels[agreed], depths[agreed])
+    found, true = (project(views[0].camera, p)[0] for p in (points, on_plane(views[3], pixels[agreed])))
+    assert np.median(np.abs(found - true)) < 0.5  # px
+
+
+def on_plane(view: View, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    return unproject(view.camera, pixels, np.ones(len(pixels)))
+
+
+def test_flat_and_contradicting_photos_do_not_agree() -> None:
+    scene = textured_scene(8, 96)
+    assert scene.seen is not None
+    pixels = np.random.default_rng(0).integers(20, 76, (100, 2)).astype(np.float64) + 0.5
+    ranges = np.tile([0.7, 1.5], (100, 1))
+    flat = [replace(view, image=np.full_like(view.image, 128)) for view in scene.train]
+    assert not Agreement(flat, scene.seen).depths(3, pixels, ranges)[1].any()
+    rng = np.random.default_rng(1)
+    noise = [replace(v, image=rng.integers(0, 256, v.image.shape).astype(np.uint8)) for v in scene.train]
+    assert Agreement(noise, scene.seen).depths(3, pixels, ranges)[1].mean() < 0.2
+    assert not Agreement(scene.train[:2], scene.seen).depths(0, pixels, ranges)[1].any()
+    assert Agreement(scene.train, {}).depths(0, pixels, ranges)[0].shape == (
+        100,
+    )  # what they see is not known

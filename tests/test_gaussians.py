@@ -1,4 +1,4 @@
-"""The start from a point cloud, against brute force and closed forms."""
+"""The start from a point cloud: against brute force and closed forms, and as neighbours lie."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_scene import tiny_scene
 
+from hqgs.model.constants import THINNEST
 from hqgs.model.gaussians import Gaussians, mean_square_distance
 from hqgs.model.shapes import as_discs, enlarge
 from hqgs.scene.world import World
+from tests.reference import rotation_matrices
 
 
 def brute_force(points: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -111,3 +114,78 @@ def test_what_is_no_tensor_stays_with_any_copy() -> None:
     assert torch.equal(copies[4].errors, torch.tensor([3.0, 1.0]))  # pyright: ignore
     assert made.like(made.rows(rows).named()).errors is None
     assert [*made.named()] == ["means", "scales", "quats", "opacities", "sh0", "shN"]
+
+
+# --- Gaussians start as their neighbours lie
+
+
+def started(points: np.ndarray) -> tuple[Gaussians, Gaussians]:
+    """The Gaussians of a cloud as 3DGS starts, and as discs."""
+    made = Gaussians.from_points(points.astype(np.float32), np.full((len(points), 3), 99, np.uint8), 1)
+    return made, as_discs(made)
+
+
+def axes(gaussians: Gaussians) -> torch.Tensor:
+    """[N, 3, 3], the axes as columns."""
+    return rotation_matrices(gaussians.quats.double())
+
+
+def test_points_of_a_plane_become_discs_in_it() -> None:
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    flat = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
+    round_ones, discs = started((flat + rng.uniform(-0.2, 0.2, flat.shape) * [1, 1, 0]) @ turn.T)
+    normals = axes(discs)[:, :, 2]
+    torch.testing.assert_close((normals @ torch.from_numpy(turn[:, 2])).abs(), torch.ones(400).double())
+    shape = (discs.scales - round_ones.scales).exp()
+    torch.testing.assert_close(shape[:, 0] * shape[:, 1], torch.ones(400), rtol=1e-5, atol=0)
+    torch.testing.assert_close(shape[:, 2] / shape[:, 0], torch.full((400,), THINNEST[2]), rtol=1e-5, atol=0)
+    for name in ("means", "opacities", "sh0", "shN"):
+        assert getattr(discs, name) is getattr(round_ones, name)
+
+
+def test_points_of_a_line_become_needles_along_it() -> None:
+    along = np.array([2.0, -1.0, 0.5]) / np.linalg.norm([2.0, -1.0, 0.5])
+    _, needles = started(np.linspace(0, 9, 50)[:, None] * along)
+    turned = (axes(needles)[:, :, 0] @ torch.from_numpy(along)).abs()
+    torch.testing.assert_close(turned, torch.ones(50).double())
+    thinner = (needles.scales[:, 1:] - needles.scales[:, :1]).exp()
+    torch.testing.assert_close(thinner, torch.tensor(THINNEST[1:]).expand(50, 2), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("count", [4, 5, 300])
+def test_any_cloud_gives_finite_gaussians_of_unit_quaternions(count: int) -> None:
+    points = np.random.default_rng(1).normal(size=(count, 3))
+    for cloud in (points, np.ones((count, 3)), points * [1e6, 1e-6, 1]):
+        _, discs = started(cloud)
+        assert all(torch.isfinite(tensor).all() for tensor in discs.named().values())
+        assert all(tensor.is_contiguous() for tensor in discs.named().values())
+        torch.testing.assert_close(discs.quats.norm(dim=1), torch.ones(count))
+        torch.testing.assert_close(torch.linalg.det(axes(discs)), torch.ones(count).double())
+
+
+# --- The smallest Gaussian that photos show: its size, and the gradient of the trained size
+
+
+def test_variances_add_and_the_gradient_is_that_of_the_sum() -> None:
+    scene = tiny_scene()
+    gaussians = Gaussians.from_points(scene.points, scene.point_colors)
+    n, generator = len(gaussians), torch.Generator().manual_seed(0)
+    smallest = torch.rand(n, generator=generator).double()
+    scales = torch.randn(n, 3, generator=generator).double().requires_grad_()
+    gaussians.scales = scales
+    found = enlarge(gaussians, smallest)
+    variances = np.exp(2 * scales.detach().numpy()) + np.square(smallest.numpy())[:, None]
+    np.testing.assert_allclose(found.scales.detach().exp().square(), variances, rtol=1e-12)
+    assert found.opacities is gaussians.opacities
+    # d log sqrt(e^(2 s) + m^2) / ds by differences.
+    weights = torch.randn(n, 3, generator=generator).double()
+    (found.scales * weights).sum().backward()
+    step = 1e-6
+    sides = [
+        0.5 * np.log(np.exp(2 * (scales.detach().numpy() + h)) + np.square(smallest.numpy())[:, None])
+        for h in (step, -step)
+    ]
+    assert scales.grad is not None
+    expected = weights.numpy() * (sides[0] - sides[1]) / (2 * step)
+    np.testing.assert_allclose(scales.grad, expected, rtol=1e-6, atol=1e-9)

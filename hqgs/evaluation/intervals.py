@@ -3,7 +3,7 @@
 A scene is photographed from a few of the places from which it could be: another draw of held-out photos gives
 another mean. The interval holds the mean over all such photos in CONFIDENCE of the draws. It is Student's,
 of the photos' own values, photos being what is drawn: patches drawn within drawn photos count what differs
-within a photo twice, and cover 97.5 % and more (`tests/test_intervals.py` and docs/log.md have the figures).
+within a photo twice, and cover 97.5 % and more (`tests/test_results.py` and docs/log.md have the figures).
 """
 
 from __future__ import annotations
