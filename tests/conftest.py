@@ -24,7 +24,7 @@ if sys.dont_write_bytecode:  # as in many containers: each of some hundred proce
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import torch  # noqa: E402  # not before threads are set
-from fixtures_cards import cards, photos  # noqa: E402, F401
+from fixtures_cards import cards, found_cards, photos  # noqa: E402, F401
 
 import benchmarks.scenes.kinds  # noqa: E402, F401  # tests degrade photos in all ways that the benchmarks know
 import hqgs  # noqa: E402

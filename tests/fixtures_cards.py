@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Camera, Scene, View
 
 WIDTH, HEIGHT = 192, 144
@@ -66,3 +69,13 @@ def photos(cards: Scene) -> list[np.ndarray]:
     """The nine photos of the cards, in their order."""
     views = sorted([*cards.train, *cards.test], key=lambda view: view.name)
     return [view.image.astype(np.uint8) for view in views]
+
+
+@pytest.fixture(scope="session")
+def found_cards(photos: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
+    """A folder with the photos as `photos/0.png`, ..., and in `kept` what COLMAP found; and the scene."""
+    root = tmp_path_factory.mktemp("cards")
+    (root / "photos").mkdir()
+    for k, image in enumerate(photos):
+        Image.fromarray(image).save(root / "photos" / f"{k}.png")
+    return root, load_scene(root / "photos", keep_sfm=root / "kept")

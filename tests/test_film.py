@@ -187,7 +187,7 @@ def test_a_scene_from_a_film_knows_it_at_about_its_size(cards: Scene, tmp_path: 
     smaller = load(source, frames=len(views), cache=tmp_path, downscale=2)
     noisy = degrade(scene, "noise:5")
     assert {view.film for view in (*smaller.train, *noisy.train)} == {None}
-    write_colmap_folder(source, tmp_path / "walk", tmp_path / "work", len(views))
+    write_colmap_folder(source, tmp_path / "walk", tmp_path / "sfm", len(views))  # where cameras are kept
     there = load_scene(tmp_path / "walk")
     assert all(view.film == details[view.name] for view in (*there.train, *there.test))
     (folder / "frames.json").write_text("{}")

@@ -260,20 +260,18 @@ def test_grey_photos_of_16_bits_are_seen(cards: Scene, tmp_path: Path) -> None:
         glance(tmp_path / "x.tif")
 
 
-def test_links_to_photos_that_were_moved_are_made_anew(cards: Scene, tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
-    for k, view in enumerate([*cards.train, *cards.test]):
-        Image.fromarray(view.image.astype(np.uint8)).save(tmp_path / "photos" / f"{k}.png")
+def test_links_to_photos_that_were_moved_are_made_anew(
+    found_cards: tuple[Path, Scene], tmp_path: Path
+) -> None:
+    folder, before = found_cards
+    (kept,) = (folder / "kept").iterdir()
     keep = tmp_path / "kept"
-    before = load_scene(tmp_path / "photos", keep_sfm=keep)
-    (kept,) = keep.iterdir()
-    shutil.rmtree(kept)
     left = keep / f".{kept.name}"  # as a call that was stopped leaves it
     for folder in ("photos", "masks"):
         (left / folder).mkdir(parents=True)
     for k in range(9):
         (left / "photos" / f"{k}.png").symlink_to(tmp_path / "gone" / f"{k}.png")
-    again = load_scene(tmp_path / "photos", keep_sfm=keep)
+    again = load_scene(folder / "photos", keep_sfm=keep)
     assert len(again.train) == len(before.train)
     assert [path.name for path in keep.iterdir()] == [kept.name]
 
