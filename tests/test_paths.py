@@ -45,10 +45,10 @@ def test_look_at_puts_the_target_in_the_middle_and_up_upwards() -> None:
     [
         ({"fov": 180}, "fov is 180"),
         ({"width": 0}, "the size is 0 x 378"),
-        ({"up": (0, 0, 2)}, "up is [0, 0, 2]: it lies along"),
+        ({"up": (0, 0, 2)}, "up is [0, 0, 2]: it is parallel"),
         ({"up": (0, 1)}, "up is [0, 1], wanted three"),
         ({"target": (0, 0, math.nan)}, "target is "),
-        ({"target": (0, 0, 0)}, "up is [0, 1, 0]: it lies along"),
+        ({"target": (0, 0, 0)}, "up is [0, 1, 0]: it is parallel"),
     ],
 )
 def test_look_at_refuses(change: dict[str, object], message: str) -> None:

@@ -199,7 +199,7 @@ def test_bad_scene_arguments() -> None:
         embedded_scene(Path(__file__))
     with pytest.raises(ValueError, match="views must not be empty"):
         sfm_points([])
-    with pytest.raises(ValueError, match="lies along the line from eye to target"):
+    with pytest.raises(ValueError, match="parallel to the line from eye to target"):
         look_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 
 

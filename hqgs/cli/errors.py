@@ -23,7 +23,7 @@ _WORDS = {
     errno.EACCES: "cannot be read or written: you have no right to",
     errno.EPERM: "cannot be read or written: you have no right to",
     errno.ENOENT: "is not there",
-    errno.ENOTDIR: "lies below a file, not a folder",
+    errno.ENOTDIR: "is inside a file, not a folder",
     errno.EISDIR: "is a folder, wanted a file",
     errno.ENOSPC: "cannot be written: the disk is full",
     errno.EROFS: "cannot be written: the disk is read-only",

@@ -111,8 +111,8 @@ def judge(
     each = measured(renders)
     if views and min(renders.culled()) == len(gaussians):
         raise ValueError(
-            f"{name}: none of its {len(gaussians):,} Gaussians lies before any camera of {scene.name}: the "
-            "photos' cameras are in another frame than the scene file"
+            f"{name}: none of its {len(gaussians):,} Gaussians is in front of any camera of {scene.name}: "
+            "the photos' cameras are in another frame than the scene file"
         )
     fits: list[Fitted] = []
     if fit:

@@ -41,7 +41,7 @@ class PhotoOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class LoadOptions(PhotoOptions):
-    """All that `hqgs.load` is asked for, as config.json keeps it: with None where nothing was said."""
+    """All arguments of `hqgs.load`, as config.json keeps them; None: not given."""
 
     path: str | Path = field(kw_only=False)  # kept: absolute, or the name of a built-in scene
     seed: int | None = None

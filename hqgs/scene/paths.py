@@ -49,7 +49,7 @@ def look_at(
     eye, forward = _vector("eye", eye), _vector("target", target) - _vector("eye", eye)
     right = np.cross(forward, _vector("up", up))
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(np.asarray(up, float)):
-        raise ValueError(f"up is {np.asarray(up).tolist()}: it lies along the line from eye to target")
+        raise ValueError(f"up is {np.asarray(up).tolist()}: it is parallel to the line from eye to target")
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     focal = height / (2 * math.tan(math.radians(fov) / 2))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])

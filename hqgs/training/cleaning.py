@@ -94,7 +94,7 @@ def clean(
     if counted < 2:
         raise ValueError(
             f"{scene.name} has {counted} held-out photos, wanted at least 2 (--photos SCENE --test-every N "
-            "holds out every N-th): the interval of their gains tells whether cleaning pays"
+            "holds out every N-th): their gains, with an interval, decide whether cleaning helps"
         )
     check_frame(gaussians, scene, background)
     before = held_out_psnrs(gaussians, scene, background)
