@@ -14,8 +14,7 @@ from test_learned_cameras import textured_scene
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-from hqgs.model.consistency import Agreement, SmallPhoto
-from hqgs.model.first_points import points_along_edges
+from hqgs.model.first_points import Agreement, SmallPhoto, points_along_edges
 from hqgs.pipeline import run_to_end
 from hqgs.scene.geometry import project, unproject
 from hqgs.scene.scene import Camera, Scene, View

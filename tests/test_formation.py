@@ -13,7 +13,7 @@ from hqgs.photos.formation import Kernel, Separable, blur_matrix, formation
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.jpeg import tables_of_quality
 from hqgs.photos.resize import resize_matrix
-from hqgs.training.methods.jpeg_cells import JpegCells
+from hqgs.training.methods.formed import JpegCells
 
 
 def picture(height: int, width: int) -> NDArray[np.float32]:

@@ -20,7 +20,7 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.pipeline import run_to_end
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.scene import View
-from hqgs.training.methods.held_pixels import HELD_PIXELS, PLATEAU_STEPS, HeldPixels, Plateau
+from hqgs.training.methods.formed import HELD_PIXELS, PLATEAU_STEPS, HeldPixels, Plateau
 from hqgs.training.methods.hqgs import HQGS
 from hqgs.training.trainer import Trainer
 

@@ -4,17 +4,160 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 
 from hqgs.diagnosis.blur import LARGEST, LEAST_BLUR, Blur, estimate_blur, extra_sigma
 from hqgs.diagnosis.codec import Hidden, Jpeg, estimate_hidden, film_detail, find_jpeg, quantised
-from hqgs.diagnosis.noise import estimate_noise, neighbour_correlation
-from hqgs.diagnosis.resolution import Enlargement, find_enlargement, undo_enlargement
 from hqgs.photos.formula import small_side
-from hqgs.photos.jpeg import MAX_BLOCKS
-from hqgs.photos.pixels import Floats, to_levels
+from hqgs.photos.jpeg import ENOUGH_BLOCKS, MAX_BLOCKS, blocks_of
+from hqgs.photos.pixels import Floats, luma, to_levels
+from hqgs.photos.resize import resize_matrix
+from hqgs.scene.constants import SMALLEST_SIDE
+
+FACTORS = (2, 3, 4, 6, 8)  # of enlargement that are tried
+LONGEST = 768  # px of a line that are looked at
+ROUNDING = 0.05  # levels; a residual below this counts as this
+
+
+@dataclass(frozen=True)
+class Enlargement:
+    """A photo's factor of enlargement; 1 for none."""
+
+    factor: int
+    evidence: float | None  # how much worse a grid off by half a period explains the photo; None: it is known
+    height: int  # of the photo before it was enlarged, px
+    width: int
+
+
+def find_enlargement(levels: Floats) -> Enlargement:
+    """Whether bicubic enlargement by a factor in `FACTORS` made this photo [H, W, 3] (levels 0..255).
+
+    Every line of an enlarged photo lies in the space that the enlargement matrix spans, and the grid of its
+    small pixels has a phase. The measure is the part of the lines outside that space, for the grid shifted by
+    half a period over that for the grid in place: a photo that is merely smooth gives 1 at every factor.
+    (Gallagher 2005 and Mahdian & Saic 2008 see the same period in the variance of second differences.) Both
+    axes must agree. Bilinear and Lanczos enlargement show too, more weakly.
+    """
+    height, width = levels.shape[:2]
+    grey = luma(levels)
+    candidates: list[tuple[float, int, int, int]] = []
+    for factor in FACTORS:  # every fourth line tells as much as all
+        rows = _best_size(grey[:, ::4], factor)
+        columns = _best_size(grey.T[:, ::4], factor)
+        candidates.append((min(rows[0], columns[0]), factor, rows[1], columns[1]))
+    evidence, factor, small_height, small_width = max(candidates)
+    if evidence < 2.1:  # JPEG blocks reach 1.8 at factor 2; bicubic enlargement kept in 8 bits starts at 4.5
+        return Enlargement(1, evidence, height, width)
+    return Enlargement(factor, evidence, small_height, small_width)
+
+
+def undo_enlargement(levels: Floats, height: int, width: int) -> Floats:
+    """The photo [height, width, 3] whose bicubic enlargement comes nearest to `levels` (least squares)."""
+    tall = _solve(levels, height)  # [height, W, 3]
+    return _solve(tall.swapaxes(0, 1), width).swapaxes(0, 1)
+
+
+def _best_size(lines: Floats, factor: int) -> tuple[float, int]:
+    """Evidence and small size for lines along axis 0; sizes may have been rounded up or down."""
+    size = len(lines)
+    sizes = {-(-size // factor), size // factor}
+    return max((_evidence(lines, small, factor), small) for small in sizes)
+
+
+def _evidence(lines: Floats, small: int, factor: int) -> float:
+    if small < SMALLEST_SIDE:
+        return 0.0
+    basis = _basis(small, len(lines))
+    lines = lines[: len(basis)]
+    shift = factor // 2
+    shifted = np.concatenate([lines[shift:], lines[::-1][:shift]])
+    inside = slice(3 * factor, -3 * factor)  # away from the border that the shift made up
+    in_place, off = (
+        np.sqrt(np.square((part - basis @ (basis.T @ part))[inside]).mean()) for part in (lines, shifted)
+    )
+    return float(off / max(in_place, ROUNDING)) if off > ROUNDING else 0.0
+
+
+@lru_cache(maxsize=32)
+def _basis(small: int, size: int) -> Floats:
+    """Orthonormal columns that span the first pixels of enlarged lines, [pixels, small pixels]."""
+    matrix = resize_matrix(small, size)[:LONGEST]
+    return np.linalg.qr(matrix[:, matrix.any(axis=0)])[0]
+
+
+def _solve(levels: Floats, small: int) -> Floats:
+    """The [small, ...] whose enlargement along axis 0 comes nearest to `levels`, by the normal equations."""
+    matrix = csc_array(resize_matrix(small, len(levels)))
+    right = matrix.T @ levels.reshape(len(levels), -1)
+    return splu((matrix.T @ matrix).tocsc()).solve(right).reshape(small, *levels.shape[1:])
+
+
+LARGE_PATCH, SMALL_PATCH = 5, 3  # px
+LIMIT, SMALL_LIMIT = 2.5, 4.0  # levels: photos of fine texture without noise reach 1.9, small ones 3.2
+MIN_PATCHES, MAX_PATCHES = 200, 12_000  # that are needed, and that are looked at
+
+
+def estimate_noise(levels: Floats) -> tuple[float, float] | None:
+    """White noise in a photo [H, W, 3] of levels 0..255: its standard deviation in each channel, and the
+    least that no fine texture reaches, levels; None where too few pixels tell.
+
+    Patches of all three channels span a space in which texture fills few directions and white noise all of
+    them, so the smallest eigenvalue of their covariance is the noise variance (Pyatenko 2013, Liu et al.
+    2013, Chen et al. 2015). The eigenvector comes from one half of the photo (the white fields of a
+    chessboard) and its variance is measured on the other half, and the other way round: a minimum taken and
+    measured on the same patches would come out too small. Patches with a value of exactly 0 or 255 are left
+    out, where clipping takes noise away. Noise that a later step made smooth (JPEG, enlargement) is not seen.
+    """
+    height, width = levels.shape[:2]
+    # below this the large patch has too many directions for the photo
+    size = LARGE_PATCH if height * width >= 4 * 4_000 else SMALL_PATCH
+    if min(height, width) < size:
+        return None
+    step = max(1, int(np.sqrt(height * width / MAX_PATCHES)))
+    patches = np.lib.stride_tricks.sliding_window_view(levels, (size, size), axis=(0, 1))[::step, ::step]
+    # px: the photo is cut into a chessboard of tiles of this size
+    rows, columns = np.indices(patches.shape[:2]) * step // 24
+    white = ((rows + columns) % 2 == 0).ravel()
+    vectors = patches.reshape(-1, 3 * size * size)
+    clipped = ((vectors == 0) | (vectors == 255)).any(axis=1)
+    halves = [vectors[side & ~clipped] for side in (white, ~white)]
+    if min(len(half) for half in halves) < MIN_PATCHES:
+        return None
+    covariances = [np.cov(half.T) for half in halves]
+    variances = []
+    for here, there in (covariances, covariances[::-1]):
+        flattest = np.linalg.eigh(here)[1][:, 0]
+        variances.append(flattest @ there @ flattest)
+    level = float(np.sqrt(max(np.mean(variances), 0.0)))
+    return level, LIMIT if size == LARGE_PATCH else SMALL_LIMIT
+
+
+def neighbour_correlation(levels: Floats) -> float | None:
+    """The least correlation of neighbouring pixels in the luma's noise, of a photo [H, W, 3], levels 0..255.
+
+    None: too few blocks tell. Differences have 2 (1 - r) times the noise's power, where r is the correlation
+    of their pixels: one minus the power over one pixel in that over two is r of neighbours, or less where two
+    pixels still go together. What a photo shows raises it, so it is taken of the blocks with the least. White
+    noise strong enough to be told comes to 0.12 at most, a phone's, denoised and as JPEG, to 0.24 to 0.5.
+    """
+    # px a side: blocks without clipped values tell how neighbours go together
+    blocks = blocks_of(luma(levels), 16)
+    blocks = blocks[((blocks > 0) & (blocks < 255)).all((1, 2))]
+    one, two = (
+        np.square(blocks[:, n:] - blocks[:, :-n]).mean((1, 2))
+        + np.square(blocks[..., n:] - blocks[..., :-n]).mean((1, 2))
+        for n in (1, 2)
+    )
+    if (two > 0).sum() < ENOUGH_BLOCKS:
+        return None
+    together = 1 - one[two > 0] / two[two > 0]
+    return float(max(np.quantile(together, 0.05), 0.0))  # share of the blocks that show noise and little else
+
 
 Table = tuple[tuple[int, ...], ...]
 Photo = NDArray[np.uint8] | NDArray[np.float32]

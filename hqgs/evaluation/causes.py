@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from hqgs.base.evenly import evenly
-from hqgs.diagnosis.noise import estimate_noise
+from hqgs.diagnosis.photo import estimate_noise
 from hqgs.evaluation.constants import FINE, FOG, MOST_CAMERAS, PATCH
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.metrics import color_factors

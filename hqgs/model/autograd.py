@@ -8,11 +8,53 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs import _rust
 from hqgs.base.threads import one_torch_thread
-from hqgs.model.covariances import whole
+from hqgs.model.formats.turned import quaternions
+
+# Rows and columns of the six entries that count: xx, xy, xz, yy, yz, zz.
+UPPER = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
+
+
+def quats_and_scales(covars: Tensor, means: Tensor) -> tuple[Tensor, Tensor]:
+    """Quaternions w x y z [..., N, 4] and standard deviations [..., N, 3] of covariances [..., N, 3, 3].
+
+    As for gsplat, the entries on and above the diagonal count.
+
+    They have no gradient: rotations have none where two scales are equal. Eigenvalues and eigenvectors in
+    float64, rounded to the dtype of the covariances; eigenvalues below 0 are 0. Where a covariance is not
+    finite, neither are the scales, so that the Gaussian is culled.
+
+    Raises:
+        ValueError: another type, dtype or shape than that of the `means`.
+    """
+    if not isinstance(covars, Tensor):
+        raise ValueError(f"covars: expected a torch tensor, got {covars!r:.60}")
+    if covars.dtype != means.dtype:
+        raise ValueError(f"covars: must have the dtype of means, {means.dtype}, got {covars.dtype}")
+    if covars.shape != (*means.shape[:-1], 3, 3):
+        wanted = [*means.shape[:-1], 3, 3]
+        raise ValueError(f"covars: expected shape {wanted}, got {list(covars.shape)}")
+    entries = covars.detach().double()[..., UPPER[0], UPPER[1]]
+    finite = entries.isfinite().all(-1, keepdim=True)
+    matrices = entries.new_zeros(*entries.shape[:-1], 3, 3)
+    matrices[..., UPPER[1], UPPER[0]] = entries.where(finite, 0.0)  # below the diagonal, where eigh looks
+    values, axes = torch.linalg.eigh(matrices)
+    axes = axes * torch.where(torch.linalg.det(axes) < 0, -1.0, 1.0)[..., None, None]
+    scales = values.clamp(min=0).sqrt().where(finite, torch.nan)
+    quats = torch.from_numpy(quaternions(axes.reshape(-1, 3, 3).numpy())).view(*axes.shape[:-2], 4)
+    return quats.to(covars.dtype), scales.to(covars.dtype)
+
+
+def whole(upper: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Matrices [N, 3, 3] with these entries [N, 6], and 0 below the diagonal."""
+    matrices = np.zeros((len(upper), 3, 3), upper.dtype)
+    matrices[:, UPPER[0], UPPER[1]] = upper
+    return matrices
+
 
 LEAST_ALPHA = 1e-10  # by which an expected depth is divided
 _ZERO = {dtype: torch.zeros((), dtype=dtype) for dtype in (torch.float32, torch.float64)}
@@ -86,9 +128,10 @@ class _Project(torch.autograd.Function):
         colors_vary = needs_means or needs_viewmats or needs_harmonics or needs_rest
         others = (*options, enabled and colors_vary), sh_degree, activate
         inputs = as_array(means), as_array(quats), as_array(scales), as_array(opacities), as_array(colors)
-        cameras, ctx.pose = [as_array(matrices) for matrices in (viewmats, Ks)], viewmats.dtype
+        poses, intrinsics = (as_array(matrices).astype(np.float64) for matrices in (viewmats, Ks))
+        ctx.pose = viewmats.dtype
         frame, *arrays = _rust.project_forward(
-            *inputs, _optional(rest), *(m.astype(np.float64) for m in cameras), width, height, *others
+            *inputs, _optional(rest), poses, intrinsics, width, height, *others
         )
         n, c = means.shape[0], viewmats.shape[0]
         ctx.frame, ctx.shapes, ctx.has_harmonics = frame, (n, c), sh_degree is not None

@@ -20,8 +20,7 @@ from hqgs.model.arguments import (
     shape_of,
     short,
 )
-from hqgs.model.autograd import _Composite, _Project
-from hqgs.model.covariances import quats_and_scales
+from hqgs.model.autograd import _Composite, _Project, quats_and_scales
 from hqgs.model.meta import Later, Meta, OfScene, Pairs, RasterizationMeta
 
 __all__ = ["RasterizationMeta", "rasterization"]

@@ -11,8 +11,7 @@ from hqgs.base.left_out import LeftOut
 from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
 from hqgs.diagnosis.scene import Diagnosis, Inspector
-from hqgs.model.consistency import Agreement
-from hqgs.model.first_points import Colors, Points, points_along_edges
+from hqgs.model.first_points import Agreement, Colors, Points, points_along_edges
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.shapes import as_discs
 from hqgs.scene.scene import Scene

@@ -27,8 +27,7 @@ from hqgs.training.config import (
     TrainConfig,
     with_iterations,
 )
-from hqgs.training.methods.formed import noise_of
-from hqgs.training.methods.held_pixels import HELD_PIXELS
+from hqgs.training.methods.formed import HELD_PIXELS, noise_of
 from hqgs.training.methods.hqgs import KNEE
 from hqgs.training.methods.photometric import LAMBDA_DSSIM
 from hqgs.training.plan import Facts, PlanRow, RunPlan, StepSeconds

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hqgs.base.files import PLY
-from hqgs.model.formats import gltf, ksplat, ply, sog, splat, spz
+from hqgs.model.formats import gltf, ply, sog, splat, spz
 from hqgs.model.formats.arrays import TENSORS, Arrays, Format
 from hqgs.model.formats.beside import in_data_frame, keep_world, read_world
 from hqgs.photos.files import DECODE_ERRORS
@@ -19,7 +19,7 @@ from hqgs.scene.world import World
 
 # By the ends of their files' names; where two fit, the longer counts.
 FORMATS: dict[str, Format] = {
-    name: row for module in (ply, spz, splat, gltf, sog, ksplat) for name, row in module.FORMATS.items()
+    name: row for module in (ply, spz, splat, gltf, sog) for name, row in module.FORMATS.items()
 }
 WRITTEN = [name for name, row in FORMATS.items() if row.write is not None]
 DAMAGED = (

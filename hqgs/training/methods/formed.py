@@ -5,22 +5,214 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from hqgs.diagnosis.resolution import undo_enlargement
+from hqgs import _rust
+from hqgs.diagnosis.photo import undo_enlargement
 from hqgs.diagnosis.scene import Inspector
-from hqgs.photos.formation import Operator, formation
+from hqgs.photos.formation import Operator, Separable, formation
 from hqgs.photos.formula import FILM, Degradation, parse_formation, small_side
-from hqgs.photos.jpeg import tables_of_quality
+from hqgs.photos.jpeg import Tables, tables_of_quality
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import AUTO
 from hqgs.training.methods.base import Target
-from hqgs.training.methods.held_pixels import HeldPixels
-from hqgs.training.methods.jpeg_cells import Coefficients, JpegCells
+
+BLOCK = 8
+# R, G, B to Y, Cb, Cr (ITU-T T.871, without the offset of the chroma, which no difference sees).
+TO_YCBCR = ((0.299, 0.587, 0.114), (-0.168735892, -0.331264108, 0.5), (0.5, -0.418687589, -0.081312411))
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """DCT coefficients on the scale where white is 1."""
+
+    luma: Tensor  # [rows, columns, 1], padded to whole blocks
+    chroma: Tensor  # [rows, columns, 2] of the channels at half the size
+
+
+class JpegCells:
+    """Distance of a picture to the cells of a JPEG photo with 4:2:0 chroma: what the file leaves open costs
+    nothing.
+
+    A JPEG file tells of each DCT coefficient only the nearest multiple of its step. A render whose
+    coefficient lies within half a step of it would give the same file, so a pixel loss, which pulls it to the
+    decoded photo, paints the codec's blocks. The views fill the cells: each photo is quantised in another
+    place.
+    """
+
+    def __init__(self, tables: Tables, height: int, width: int) -> None:
+        """`height`, `width`: of the photo, px."""
+        to_ycbcr = np.array(TO_YCBCR)
+        rows, columns = (_analysis(side, halve=False) for side in (height, width))
+        self._luma = Separable.of(rows, columns, to_ycbcr[:1])
+        rows, columns = (_analysis(side, halve=True) for side in (height, width))
+        self._chroma = Separable.of(rows, columns, to_ycbcr[1:])
+        luma, chroma = (torch.tensor(table).reshape(BLOCK, BLOCK) / 255 for table in tables)
+        self._luma_steps = _tile(luma, self._luma, 1)
+        self._chroma_steps = _tile(chroma, self._chroma, 2)
+        self._pixels = height * width
+
+    def coefficients(self, image: Tensor) -> Coefficients:
+        """Of a picture [H, W, 3], white at 1; differentiable."""
+        return Coefficients(self._luma(image), self._chroma(image))
+
+    def centres(self, photo: Tensor) -> Coefficients:
+        """The centres of the cells of a decoded photo [H, W, 3]: the nearest multiples of the steps.
+
+        Decoding clips, rounds and smooths the chroma, so the coefficients of the decoded pixels are a little
+        off the multiples that the file holds.
+        """
+        c = self.coefficients(photo)
+        return Coefficients(_nearest(c.luma, self._luma_steps), _nearest(c.chroma, self._chroma_steps))
+
+    def loss(self, image: Tensor, centres: Coefficients) -> Tensor:
+        """Mean distance to the cells per colour value, a scalar; 0 where the file could be this picture's.
+
+        Args:
+            image: [H, W, 3], white at 1.
+            centres: of the photo, of the image's dtype.
+        """
+        c, scale = self.coefficients(image), 1 / (3 * self._pixels)
+        luma = _Distance.apply(c.luma, centres.luma, self._luma_steps, scale)
+        return luma + _Distance.apply(c.chroma, centres.chroma, self._chroma_steps, scale)
+
+
+class _Distance(torch.autograd.Function):
+    """`scale` times the sum of relu(|c - centre| - steps / 2). The gradient comes with the value."""
+
+    @staticmethod
+    def forward(ctx: Any, c: Tensor, centres: Tensor, steps: Tensor, scale: float) -> Tensor:
+        x, y, widths = (t.detach().contiguous().numpy() for t in (c, centres, steps.to(c)))
+        value, grad = _rust.cell_distance(x, y, widths, scale, ctx.needs_input_grad[0])
+        if grad is not None:
+            ctx.save_for_backward(torch.from_numpy(grad).view(c.shape))
+        return c.new_tensor(value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's own is too general)
+        ctx: Any, v_distance: Tensor
+    ) -> tuple[Tensor, None, None, None]:
+        (grad,) = ctx.saved_tensors
+        return v_distance * grad, None, None, None
+
+
+def _nearest(c: Tensor, steps: Tensor) -> Tensor:
+    return torch.round(c / steps) * steps
+
+
+def _tile(steps: Tensor, operator: Separable, channels: int) -> Tensor:
+    rows, columns = (side // BLOCK for side in operator.size)
+    return steps.repeat(rows, columns)[..., None].repeat(1, 1, channels)
+
+
+def _analysis(side: int, halve: bool) -> NDArray[np.float64]:
+    """The matrix from pixels to DCT coefficients along one axis, [whole blocks, side].
+
+    The last pixel is repeated to fill the last block, as libjpeg does; `halve` takes means of two first.
+    """
+    unit = 2 * BLOCK if halve else BLOCK
+    padded = -(-side // unit) * unit
+    matrix: NDArray[np.float64] = np.eye(side)[np.minimum(np.arange(padded), side - 1)]
+    if halve:
+        matrix = (matrix[::2] + matrix[1::2]) / 2
+    k, x = np.arange(BLOCK)[:, None], np.arange(BLOCK)
+    dct = np.cos((2 * x + 1) * k * np.pi / (2 * BLOCK)) * np.sqrt(2 / BLOCK)
+    dct[0] /= np.sqrt(2)
+    blocks = matrix.reshape(-1, BLOCK, side)
+    return (dct @ blocks).reshape(-1, side)
+
+
+HELD_PIXELS = 50  # one pixel of so many is held back under noise
+PLATEAU_STEPS = 200  # from one look at them to the next, at least; without a gain the rates are halved
+
+
+@dataclass(frozen=True)
+class HeldPixels:
+    """Pixels of one photo that its loss leaves out."""
+
+    photo: int  # its number in the scene
+    places: Tensor  # [P], of the rows of the photo as [H W, 3]
+    colors: Tensor  # [P, 3], white at 1
+
+    @classmethod
+    def draw(cls, number: int, photo: Tensor, mask: Tensor | None) -> tuple[HeldPixels, Tensor]:
+        """One of HELD_PIXELS pixels [H, W, 3] that count, and the mask, bool [H, W], of the others.
+
+        The draw follows from the photo's number alone.
+        """
+        counts = torch.ones(photo.shape[:2], dtype=torch.bool) if mask is None else mask.clone()
+        places = torch.nonzero(counts.ravel())[:, 0].numpy()
+        drawn = np.random.default_rng(number).choice(
+            places, math.ceil(1 / HELD_PIXELS * len(places)), replace=False
+        )
+        held = torch.from_numpy(drawn)
+        counts.view(-1)[held] = False
+        colors = torch.from_numpy(as_floats(photo.reshape(-1, 3)[held].numpy()))
+        return cls(number, held, colors), counts
+
+    def error(self, image: Tensor) -> Tensor:
+        """Mean squared error there of `image` [H, W, 3], a float64 scalar."""
+        return (image.detach().reshape(-1, 3)[self.places] - self.colors).square().double().mean()
+
+
+class Plateau:
+    """The learning rates that the held pixels ask for.
+
+    White noise in a pixel tells nothing of the noise beside it, so a render comes nearer to these pixels only
+    where it comes nearer to the scene. Every PLATEAU_STEPS steps, rounded up to whole epochs, their mean
+    squared error is looked at. They are the same pixels each time, so their noise is in each error alike.
+    Where it is not smaller than at the best look, the rates are halved, as on a plateau of any held-back
+    error.
+    """
+
+    def __init__(self, num_photos: int) -> None:
+        self.rate_left: float = 1.0  # share of the learning rates
+        self._interval = num_photos * math.ceil(PLATEAU_STEPS / num_photos)
+        self._steps = 0
+        self._sums, self._counts = torch.zeros(2, num_photos, dtype=torch.float64)
+        self._best = torch.full((num_photos,), torch.nan, dtype=torch.float64)
+
+    def see(self, photo: int, error: Tensor) -> None:
+        """Note a step: the error of the held pixels of the photo of that number."""
+        if torch.isfinite(error):  # otherwise the step is skipped, or all of the photo is masked
+            self._sums[photo] += error
+            self._counts[photo] += 1
+        self._steps += 1
+        if self._steps % self._interval == 0:
+            self._look()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        rate, steps = torch.tensor(self.rate_left, dtype=torch.float64), torch.tensor(self._steps)
+        errors = {"sums": self._sums, "counts": self._counts, "best": self._best}
+        return {"rate_left": rate, "steps": steps} | {name: t.clone() for name, t in errors.items()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """KeyError where a part is missing, ValueError where it is of other photos."""
+        for name in ("sums", "counts", "best"):
+            if state[name].shape != self._best.shape:
+                raise ValueError(f"{name} is {list(state[name].shape)}, wanted {list(self._best.shape)}")
+        self.rate_left, self._steps = float(state["rate_left"]), int(state["steps"])
+        self._sums, self._counts, self._best = (state[name].clone() for name in ("sums", "counts", "best"))
+
+    def _look(self) -> None:
+        now = self._sums / self._counts  # NaN for a photo that no step has seen since the last look
+        gains = self._best - now
+        known = torch.isfinite(gains)
+        if known.any() and gains[known].mean() <= 0:
+            self.rate_left /= 2
+        else:
+            self._best = torch.where(torch.isfinite(now), now, self._best)
+        self._sums.zero_()
+        self._counts.zero_()
+
 
 # Levels of noise that the codec of a coarse film counts as: +0.4 dB to none on four scenes under `video:36`.
 FILM_NOISE = 20.0

@@ -22,8 +22,7 @@ from hqgs.training.checkpoint import part
 from hqgs.training.config import HQGSConfig
 from hqgs.training.methods.base import Method
 from hqgs.training.methods.cameras import LearnedCamera, LearnedCameras, LearnedDevices, Shot, no_shot
-from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
-from hqgs.training.methods.held_pixels import HeldPixels, Plateau
+from hqgs.training.methods.formed import Formation, FormedTarget, HeldPixels, Plateau, find_formation
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.plan import Facts
 from hqgs.training.state import TrainState
