@@ -148,7 +148,7 @@ def test_bad_input_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[s
     foggy().save(file)
     for options, message in (
         ([str(file), "--out", str(tmp_path / "new.ply")], "give --photos, a folder of photos"),
-        ([str(file), "--out", str(file), "--photos", "embedded"], "what is removed would be lost"),
+        ([str(file), "--out", str(file), "--photos", "embedded"], "what is left out would be lost"),
         ([str(file), "--out", str(tmp_path / "new.obj"), "--photos", "embedded"], "new.obj"),
         ([str(tmp_path / "no.ply"), "--out", str(tmp_path / "new.ply")], "no.ply"),
         (

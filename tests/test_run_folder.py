@@ -280,6 +280,15 @@ def test_a_plan_is_of_all_photos(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert pictures(tmp_path / "photos").of == 40
 
 
+def test_a_plan_beside_a_run_holds_out_as_that_does(
+    trained: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos, run = map(str, trained)
+    for said, count in ((["--out", run], 9), (["--out", run, "--test-every", "8"], 10), ([], 10)):
+        assert main(["plan", photos, "--method", "3dgs", *said]) == 0
+        assert f"{count} photos to train on" in capsys.readouterr().out
+
+
 def test_a_folder_that_is_called_as_a_built_in_scene_is_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

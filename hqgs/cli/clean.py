@@ -13,7 +13,7 @@ from hqgs.base.options import Number, given
 from hqgs.cli.errors import fail
 from hqgs.cli.judge import check_source
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Measured, check_above, measured_scene, tell_read
+from hqgs.cli.scenes import Measured, check_out_file, measured_scene, tell_read
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
@@ -35,15 +35,11 @@ OPTIONS = Clean
 
 def run(options: Clean) -> int:
     """Clean and say what it gained; return the exit code (0 done, 1 no gain or failed, 2 bad input)."""
-    from hqgs.model.formats.files import format_of  # here: --help waits for no array
+    from hqgs.model.formats.files import format_of, scene_file  # here: --help waits for no array
 
     format = format_of(options.out, written=True)
-    check_above(options.out)
+    check_out_file(options.out, scene_file(options.source))
     source = check_source(options.source, options.photos)
-    if options.out.exists() and options.out.samefile(source):
-        raise ValueError(
-            f"--out is the source {source} itself: name another file, or what is removed would be lost"
-        )
     from hqgs.evaluation.run_folder import RunFolder  # here: they load torch
     from hqgs.model.gaussians import Gaussians
     from hqgs.training.cleaning import CLEANING_STEPS, check_steps, clean, held_out_psnrs

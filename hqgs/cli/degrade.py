@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
+import hqgs
 from hqgs.base.files import check_new_folder
 from hqgs.base.options import Folder
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Photos, load, ready
+from hqgs.cli.scenes import Photos, ready
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.options import KINDS
 
@@ -34,10 +35,11 @@ def run(options: Degrade) -> int:
     degradation = parse_degradation(options.kind)
     check_new_folder(options.out)
     ready(options.scene)
-    with LoadingScreen() as screen:
-        scene = load(options, screen)
     from hqgs.scene.degrade import write_degraded_scene  # here: it loads torch
 
+    asked: dict[str, Any] = {"downscale": options.downscale, "skip_unreadable": False, "points": False}
+    with LoadingScreen() as screen:
+        scene = hqgs.load(options.scene, **asked, on_stage=screen.stage)
     write_degraded_scene(scene, options.out, degradation, options.seed)
     photos = f"{len(scene.train)} training photos with {degradation}, {len(scene.test)} held out"
     print(f"{options.out}: {photos}")

@@ -11,9 +11,8 @@ import tyro
 from hqgs.base.options import Factor, Flag, Number, Unsaid, values
 from hqgs.base.text import markdown_table
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Measured, Photos, check_above, load, measured_scene, ready, tell_read
+from hqgs.cli.scenes import Measured, check_out_file, measured_scene, ready, tell_read
 from hqgs.model.formats.files import FORMATS, WRITTEN, format_of, scene_file
-from hqgs.scene.names import is_room
 from hqgs.show.export_options import ExportOptions
 
 if TYPE_CHECKING:
@@ -64,11 +63,7 @@ def run(args: ExportScene) -> int:
     options = ExportOptions(format_of(args.out, args.format, written=True), **said)
     _check_together(args, options.format)
     source = scene_file(args.source)
-    check_above(args.out)
-    if args.out.exists() and args.out.samefile(source):
-        raise ValueError(
-            f"--out is the source {source} itself: name another file, or what is left out would be lost"
-        )
+    check_out_file(args.out, source)
     if args.trust and not FORMATS[options.format].errors:
         places = " and ".join(f".{name}" for name, format in FORMATS.items() if format.errors)
         raise ValueError(f"--trust: a .{options.format} file cannot store it; {places} files can")
@@ -124,8 +119,6 @@ def _held_out_photos(run: RunFolder, args: ExportScene) -> Scene:
     photos = str(args.scene)
     ready(photos)
     with LoadingScreen() as screen:
-        if is_room(photos):
-            return load(Photos(scene=photos, downscale=args.downscale), screen)
         asked = Measured(source=args.source, photos=photos, downscale=args.downscale)
         return measured_scene(run, asked, screen)
 

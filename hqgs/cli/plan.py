@@ -43,7 +43,7 @@ def run(options: PlanOptions) -> int:
     from hqgs.training.prepare import Prepared, plan_of_photos
     from hqgs.training.trainer import Trainer
 
-    told = RunFolder(options.out).loaded if posed and options.out is not None else {}
+    told = {} if options.out is None else RunFolder(options.out).loaded
     asked: dict[str, Any] = {
         "downscale": options.downscale,
         "longest": longest_side(options.preset, options.downscale),

@@ -157,14 +157,6 @@ def measured_scene(run: RunFolder, asked: Measured, screen: LoadingScreen) -> Sc
     return scene
 
 
-def load(photos: Photos, screen: LoadingScreen) -> Scene:
-    """The scene of a command that takes no more than the photos."""
-    from hqgs.scene.source import load as load_source  # here: it loads torch
-
-    asked, stage = photos.downscale, screen.stage
-    return load_source(photos.scene, downscale=asked, skip_unreadable=False, points=False, on_stage=stage)
-
-
 def check_out(out: Path, scene: str, resume: bool, overwrite: bool) -> list[str]:
     """Lines on what is there, for the user.
 
@@ -189,10 +181,14 @@ def check_out(out: Path, scene: str, resume: bool, overwrite: bool) -> list[str]
     return lines
 
 
-def check_out_file(out: Path) -> None:
-    """ValueError where `--out` cannot be a file: before the work, or its result would be lost."""
+def check_out_file(out: Path, source: Path | None = None) -> None:
+    """ValueError where `--out` cannot be a file: before the work, or its result, or the source, is lost."""
     if out.is_dir():
         raise ValueError(f"--out {out} is a folder: name the file to write")
+    if source is not None and out.exists() and out.samefile(source):
+        raise ValueError(
+            f"--out is the source {source} itself: name another file, or what is left out would be lost"
+        )
     check_above(out)
 
 

@@ -190,8 +190,8 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
     tell_notes(scene)
     loaded = time.perf_counter()
     length = f"at most {config.iterations:,} iterations"
-    if options.seconds is not None:
-        length = f"{duration(options.seconds)} of training"
+    if config.seconds is not None:
+        length = f"{duration(config.seconds)} of training"
     print(f"measuring the photos, then {length}", flush=True)
     live = None
     if options.view and ranks.first:
