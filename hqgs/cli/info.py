@@ -123,8 +123,8 @@ def _photos(path: Path) -> list[str]:
     lines = [
         f"{root}: {len(photos.names)} photos of {', '.join(f'{w} x {h}' for w, h in sizes[:4])} px"
         + (" and other sizes" if len(sizes) > 4 else ""),
-        f"cameras: {len(guess.sizes)}; EXIF has the focal length of {focal} photos, and says that "
-        f"{sum(exif.quarter_turns > 0 for exif in photos.exif)} are stored on their side",
+        f"cameras: {len(guess.sizes)}; EXIF has the focal length of {focal} photos, and rotates "
+        f"{sum(exif.quarter_turns > 0 for exif in photos.exif)} of them",
         f"poses: {poses}",
     ]
     others = beside(root, photos.folder) if formats else []  # they are read

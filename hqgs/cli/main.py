@@ -90,7 +90,7 @@ def command(argv: Sequence[str] | None) -> int:
         near = get_close_matches(name, COMMANDS, n=1)
         mean = f"did you mean {near[0]!r}? " if near else ""
         what = "option" if name.startswith("-") else "command"
-        return fail(2, f"there is no {what} {name!r}; {mean}The commands are: {', '.join(COMMANDS)}")
+        return fail(2, f"there is no {what} {name!r}; {mean}the commands are: {', '.join(COMMANDS)}")
     options: object = None
     try:
         from hqgs.cli.parse import parse  # here: only a command waits for the parser

@@ -338,7 +338,7 @@ def half_size(draft: Draft) -> None:
         end = half_size_end(draft.settings.iterations)
         draft.change(half_size_until=end)
         left = f"full resolution in the first {end} iterations"
-        draft.note(f"1/{COARSE_FACTOR} of the sides until iteration {end:,}", why, left_out=left)
+        draft.note(f"1/{COARSE_FACTOR} of width and height until iteration {end:,}", why, left_out=left)
     else:
         why = "a start at half size was not asked for, or few points, small or degraded photos forbid it"
         draft.note("full from the start", why)

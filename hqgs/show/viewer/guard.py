@@ -31,8 +31,8 @@ ELSEWHERE = (
     "instead, which needs no server."
 )
 REFUSED = (
-    "This page answers http://localhost:{port} and http://127.0.0.1:{port} alone, so that no page elsewhere "
-    "and no other machine can read it.\n" + ELSEWHERE + "\n"
+    "This page answers http://localhost:{port} and http://127.0.0.1:{port} only, so that no other page and "
+    "no other machine can read it.\n" + ELSEWHERE + "\n"
 )
 _OURS = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
 _patching = threading.Lock()
