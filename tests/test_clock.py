@@ -138,7 +138,7 @@ def test_bad_plans_and_seconds_are_told(tmp_path: Path, capsys: pytest.CaptureFi
         '{"iterations": 0, "turn": null}',
     ):
         (tmp_path / PLAN).write_text(text)
-        with pytest.raises(ValueError, match="is no plan"):
+        with pytest.raises(ValueError, match="is not a plan"):
             repeated(config, tmp_path)
     for seconds in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="seconds is"):

@@ -241,7 +241,7 @@ def test_distorted_cameras(
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"k4": 0.1}, r"frame 0 \(images/view_00\.png\): k4 = 0\.1 has no agreed meaning"),
+        ({"k4": 0.1}, r"frame 0 \(images/view_00\.png\): k4 = 0\.1 is not defined"),
         ({"k1": "a"}, "k1 must be a finite number, got 'a'"),
         ({"fl_x": float("nan")}, "fl_x must be a finite number, got nan"),
         ({"cx": 10**400}, "cx must be a finite number"),
@@ -250,7 +250,7 @@ def test_distorted_cameras(
         ({"fl_x": None, "fl_y": None}, "no focal length"),
         ({"fl_x": None, "camera_angle_x": 4.0}, "angle of view 4.0 is not between"),
         ({"camera_model": "SPHERICAL"}, "camera_model 'SPHERICAL' is none of"),
-        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "no OpenCV fisheye"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "not an OpenCV fisheye"),
         ({"frames": []}, "list 'frames' that is not empty"),
         ({"frames": [3]}, "frame 0: expected an object, got 3"),
         ({"frames": [{"file_path": 7}]}, "file_path must be a path, got 7"),
@@ -307,7 +307,7 @@ def test_missing_files_and_duplicates(tmp_path: Path) -> None:
     write_transforms(truth, tmp_path, frames=[*entries, entries[1]], ply_file_path="none.ply")
     scene = load_scene(tmp_path)
     assert len(scene.train) + len(scene.test) == 3
-    assert scene.notes[0].startswith("ply_file_path 'none.ply' names no file in")
+    assert scene.notes[0].startswith("ply_file_path 'none.ply' is not a file in")
     write_transforms(truth, tmp_path)
     (tmp_path / "images/view_02.png").unlink()
     scene = load_scene(tmp_path)

@@ -304,7 +304,7 @@ def test_names_that_new_suffixes_would_mix_up_are_refused(tmp_path: Path, names:
 def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str) -> None:
     scene = tiny_scene()
     train = [replace(scene.train[0], name=name.format(tmp_path))]
-    with pytest.raises(ValueError, match="leaves the folder"):
+    with pytest.raises(ValueError, match="is outside of the folder"):
         write(replace(scene, train=train), tmp_path / "out", "noise:10")
     assert list(tmp_path.iterdir()) == []
 
@@ -317,7 +317,7 @@ def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str) -> 
         ({"held_out": "view0.png"}, "held_out is 'view0.png', wanted list"),
         ({"notes": [3]}, r"notes\[0\] is 3, wanted str"),
         ({"train": {"view1.png": 3}}, r"train\['view1\.png'\] is 3, wanted str"),
-        ({"train": {"view1.png": "../clean.png"}}, "leaves the folder"),
+        ({"train": {"view1.png": "../clean.png"}}, "is outside of the folder"),
         ({"train": {"view1.png": "images/../low/view9.png"}}, "has no small photo"),
         ({"train": {"view1.png": "large.png"}}, r"large\.png is 25 x 16, its photo 24 x 16"),
         ({"more": 1}, "is damaged: .*more"),

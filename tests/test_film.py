@@ -147,15 +147,15 @@ def test_a_title_that_is_no_text_is_passed_by(tmp_path: Path, suffix: str) -> No
 
 def test_a_film_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "no.mp4").write_text("a text")
-    with pytest.raises(ValueError, match=r"no\.mp4 cannot be read: it is no film, or damaged$"):
+    with pytest.raises(ValueError, match=r"no\.mp4 cannot be read: it is not a film, or damaged$"):
         load(tmp_path / "no.mp4")
     with pytest.raises(ValueError, match="frames is 2, wanted at least 3"):
         film_frames(tmp_path / "no.mp4", tmp_path, 2)
-    with pytest.raises(ValueError, match=r"it is no film, or damaged$"):
+    with pytest.raises(ValueError, match=r"it is not a film, or damaged$"):
         load(tmp_path / "no.mp4", cache=tmp_path / "runs" / "new")
     assert sorted(os.listdir(tmp_path)) == ["no.mp4"]  # nor the folder of a run, nor the one above it
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=r"it is no film, or damaged$"):
+    with pytest.raises(ValueError, match=r"it is not a film, or damaged$"):
         load(tmp_path / "no.mp4", cache=tmp_path / "empty")
     assert list((tmp_path / "empty").iterdir()) == []  # the user's own folder stays
     (tmp_path / "empty").rmdir()

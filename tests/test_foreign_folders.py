@@ -333,7 +333,7 @@ def test_a_photo_that_is_gone_with_its_mask_is_left_out(tmp_path: Path) -> None:
     for name in truth.names:
         Image.new("L", (48, 36), 255).save(tmp_path / "masks" / name)
     (tmp_path / "masks/view_03.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"view_03.*mask_path 'masks/view_03\.png' names no file"):
+    with pytest.raises(FileNotFoundError, match=r"view_03.*mask_path 'masks/view_03\.png' is not a file"):
         load_scene(tmp_path)
     (tmp_path / "images/view_03.png").unlink()
     assert len(load_scene(tmp_path, test_every=0).train) == 4

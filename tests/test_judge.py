@@ -204,11 +204,11 @@ def test_mistakes_get_a_sentence(run: Path, tmp_path: Path, capsys: pytest.Captu
     foreign, photos = tmp_path / "foreign.ply", ["--photos", "embedded"]
     cases = [
         ([tmp_path / "missing.ply", *photos], "there is no"),
-        ([foreign], "is no folder of a run: give --photos, a folder of photos"),
+        ([foreign], "is not the folder of a run: give --photos, a folder of photos"),
         ([foreign, "--photos", tmp_path / "nowhere"], "there is no scene folder"),
         ([foreign, "--photos", tmp_path / "bare"], "has no cameras"),
         ([foreign, *photos, "--views", "x.png"], "has no photo 'x.png'"),
-        ([foreign, *photos, "--against", tmp_path / "no.json"], "is no judge.json"),
+        ([foreign, *photos, "--against", tmp_path / "no.json"], "is not a judge.json"),
         ([tmp_path / "away.ply", *photos], "none of its"),
         ([run, "--test-every", "4"], "--downscale and --test-every need --photos"),
         ([], "missing: SOURCE"),

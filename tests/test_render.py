@@ -137,7 +137,7 @@ def test_a_bare_file_gets_an_orbit(folder: Path, tmp_path: Path) -> None:
         (["--size", "7", "x"], "--size is 7 x, wanted two whole numbers"),
         (["--size", "0", "4"], "the size is 0 x 4, wanted at least 1 x 1"),
         (["--out", "/dev/null/x.gif"], "--out /dev/null/x.gif is inside /dev/null, which is a file"),
-        (["--out", "film.txt"], "film.txt is no folder"),
+        (["--out", "film.txt"], "film.txt is not a folder"),
         (["--out", "folder.gif"], "folder.gif is a folder: name a file, or a folder without .gif"),
         (["--out", "a.mp4"], "no PyAV"),
         (["--out", "a.mp4", "--size", "1", "8"], "a film has sides of at least 2 px, these are 1 x 8"),
@@ -213,7 +213,9 @@ def test_films_of_mixed_sizes_and_unknown_kinds(folder: Path, tmp_path: Path) ->
         hqgs.render_frames(model, [small], tmp_path / "a.png", show="normals")
     with pytest.raises(ValueError, match="there is no camera"):
         hqgs.render_frames(model, [], tmp_path / "a.png")
-    with pytest.raises(ValueError, match=r"a\.mov is no folder; films are \.mp4 or \.gif, a single picture"):
+    with pytest.raises(
+        ValueError, match=r"a\.mov is not a folder; films are \.mp4 or \.gif, a single picture"
+    ):
         hqgs.render_frames(model, [small], tmp_path / "a.mov")
     assert list(tmp_path.iterdir()) == []
 

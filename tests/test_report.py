@@ -275,7 +275,7 @@ def test_scene_without_held_out_views_gets_a_report(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("{", "is not valid JSON"),
-        ("[]", "is no hqgs report: it has no metrics"),
+        ("[]", "is not an hqgs report: it has no metrics"),
         ('{"metrics": {"mean": {}}}', "its metrics lack reasons, views"),
     ],
 )

@@ -185,7 +185,7 @@ def test_poses_of_nan_in_a_text_model(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (values(cx=0.52, cy=0.48), "are shares of w, h = 48, 36: multiply fl_x, fl_y, cx and cy by them"),
+        (values(cx=0.52, cy=0.48), "are fractions of w, h = 48, 36: multiply fl_x, fl_y, cx and cy by them"),
         (poses(lambda m: np.eye(4).tolist()), "all 9 photos have the same pose, which cannot be right"),
         (
             poses(lambda m: (np.diag([1, 1, -1, 1]) @ m).tolist()),

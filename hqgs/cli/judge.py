@@ -103,8 +103,8 @@ def check_source(source: Path, photos: str | None) -> Path:
     format_of(file)
     if photos is None and not (source.is_dir() and (source / CONFIG).is_file()):
         raise ValueError(
-            f"{source} is no folder of a run: give --photos, a folder of photos with their cameras (COLMAP, "
-            "nerfstudio, ...) to measure it with"
+            f"{source} is not the folder of a run: give --photos, a folder of photos with their cameras "
+            "(COLMAP, nerfstudio, ...) to measure it with"
         )
     ready(str(source) if photos is None else photos)
     return file

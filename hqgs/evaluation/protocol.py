@@ -95,12 +95,12 @@ def read_judgement(path: Path) -> dict[str, Any]:
     try:
         known = json.loads(path.read_text(encoding="utf-8"))
         if not all(isinstance(known[key], dict) for key in ("protocol", "scene")):
-            raise TypeError("protocol and scene are no objects")
+            raise TypeError("protocol and scene must be objects")
         values = known["scene"]["views"], known["scene"]["mean"], known["protocol"]["names"]
         if not all(isinstance(value, kind) for value, kind in zip(values, (dict, dict, list), strict=True)):
-            raise TypeError("views, mean and names are no objects and list")
+            raise TypeError("views and mean must be objects, names a list")
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path} is no judge.json: {error!r}") from error
+        raise ValueError(f"{path} is not a judge.json: {error!r}") from error
     return known
 
 

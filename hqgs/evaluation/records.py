@@ -113,8 +113,8 @@ def read_report(path: str | Path) -> Report:
     path = Path(path)
     report = read_json(path)
     if not isinstance(report, dict) or not isinstance(report.get("metrics"), dict):
-        raise ValueError(f"{path} is no hqgs report: it has no metrics")
+        raise ValueError(f"{path} is not an hqgs report: it has no metrics")
     missing = {"mean", "views", "reasons"} - report["metrics"].keys()
     if missing:
-        raise ValueError(f"{path} is no hqgs report: its metrics lack {', '.join(sorted(missing))}")
+        raise ValueError(f"{path} is not an hqgs report: its metrics lack {', '.join(sorted(missing))}")
     return cast(Report, report)

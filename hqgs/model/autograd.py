@@ -92,7 +92,7 @@ class _First(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads):
         raise RuntimeError(
-            "hqgs.rasterization has first derivatives alone: its gradient (create_graph=True) cannot be "
+            "hqgs.rasterization has only first derivatives: its gradient (create_graph=True) cannot be "
             "differentiated again"
         )
 

@@ -107,7 +107,7 @@ def rasterization(
     """
     refuse({"distributed": distributed, "camera_model": camera_model, **unsupported})
     if covars is not None and activate:
-        raise ValueError("activate: not with covars, which are no logarithms")
+        raise ValueError("activate: not with covars, which are not logarithms")
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     given |= {"covars": covars, "backgrounds": backgrounds, "viewmats": viewmats, "Ks": Ks}
     scenes, batch = _scenes(given, sh_degree)

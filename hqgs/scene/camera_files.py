@@ -121,11 +121,11 @@ def load_cameras(folder: str | Path) -> RunCameras:
         views = [_known(path, folder, entry, world) for entry in value["views"]]
         background = tuple(float(channel) for channel in value.get("background", BACKGROUND))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path}does not hold the cameras of a run: {error!r}") from error
+        raise ValueError(f"{path} does not hold the cameras of a run: {error!r}") from error
     if len(background) != 3 or not np.isfinite(background).all():
-        raise ValueError(f"{path}: background is no colour: {value['background']!r:.60}")
+        raise ValueError(f"{path}: background is not a colour: {value['background']!r:.60}")
     if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
-        raise ValueError(f"{path}: up is no direction: {value['up']!r:.60}")
+        raise ValueError(f"{path}: up is not a direction: {value['up']!r:.60}")
     return RunCameras(up / np.linalg.norm(up), views, background, world)
 
 
@@ -183,7 +183,7 @@ def _file(folder: Path, name: Any) -> Path | None:
         return None
     parts = PurePosixPath(name)
     if parts.is_absolute() or ".." in parts.parts or "\0" in name:
-        raise ValueError(f"photo {name!r:.60} leaves the folder")
+        raise ValueError(f"photo {name!r:.60} is outside of the folder")
     return folder / parts if (folder / parts).is_file() else None
 
 
@@ -270,7 +270,7 @@ def load_path(path: str | Path) -> tuple[list[Camera], float]:
             raise ValueError(f"fps is {fps}")
         cameras = [_frame(frame, width, height) for frame in frames]
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise ValueError(f"{path}is no camera path: {error!r}") from error
+        raise ValueError(f"{path} is not a camera path: {error!r}") from error
     return cameras, fps
 
 
@@ -292,8 +292,8 @@ def checked_camera(width: Any, height: Any, K: Any, viewmat: Any) -> Camera:
         raise ValueError(f"a picture of {width!r:.20} x {height!r:.20} px")
     K, viewmat = np.array(K, np.float64), np.array(viewmat, np.float64)
     if K.shape != (3, 3) or viewmat.shape != (4, 4) or not (np.isfinite(K).all() and K[0, 0] * K[1, 1] > 0):
-        raise ValueError("a camera's K is no pinhole")
+        raise ValueError("a camera's K is not a pinhole camera")
     R = viewmat[:3, :3]
     if not np.isfinite(viewmat).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise ValueError("a pose is no rotation and translation")
+        raise ValueError("a pose is not a rotation and translation")
     return Camera(width, height, K, viewmat)

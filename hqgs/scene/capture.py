@@ -122,12 +122,12 @@ def inside(root: Path, name: str, what: str) -> Path:
     it resolves to only where that is outside.
     """
     if "\0" in name:
-        raise ValueError(f"{what} {name!r} is no file in {root}")
+        raise ValueError(f"{what} {name!r} is not a file in {root}")
     path = Path(os.path.normpath(root / name))
     if not path.is_relative_to(root):
         path = path.resolve()
     if not path.is_relative_to(root):
-        raise ValueError(f"{what} {name!r} leaves the folder {root}")
+        raise ValueError(f"{what} {name!r} is outside of the folder {root}")
     return path
 
 

@@ -77,7 +77,7 @@ def broken(root: Path) -> str | None:
     if (folder := half_model(root)) is not None:
         return f"{folder} holds a part of a COLMAP model: wanted cameras, images, points3D, as .bin or .txt"
     names = [name for name in CAMERAS if (root / name).exists()]
-    return f"{root / names[0]} is no file" if names else None
+    return f"{root / names[0]} is not a file" if names else None
 
 
 def nothing(root: Path) -> str:

@@ -171,7 +171,7 @@ def _sharpest(
                 on_stage(Stage("frames of the film read", number + 1, stream.frames or 0))
     except (av.error.FFmpegError, OSError) as error:
         known = error.errno is not None and error.errno in errno.errorcode  # FFmpeg has numbers of its own
-        why = os.strerror(error.errno or 0) if known else "it is no film, or damaged"
+        why = os.strerror(error.errno or 0) if known else "it is not a film, or damaged"
         if best is None:
             raise ValueError(f"the film {path} cannot be read: {why}") from error
         told[f"frames after number {best[0]} cannot be read ({why})"] = None

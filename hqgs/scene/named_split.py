@@ -130,7 +130,7 @@ def _lines(path: Path) -> list[str]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is no list of names: {error}") from error
+        raise ValueError(f"{path} is not a list of names: {error}") from error
     return [line.strip().replace("\\", "/") for line in text.splitlines() if line.strip()]
 
 

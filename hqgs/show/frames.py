@@ -125,7 +125,7 @@ def check_frames(cameras: Sequence[Camera], out: Path, fps: float, show: str) ->
         if out.is_dir():
             raise ValueError(f"{out} is a folder: name a file, or a folder without {suffix}")
     elif (suffix[1:].isalpha() or suffix in OTHERS or out.exists()) and not out.is_dir():
-        raise ValueError(f"{out} is no folder; films are .mp4 or .gif, a single picture is .png")
+        raise ValueError(f"{out} is not a folder; films are .mp4 or .gif, a single picture is .png")
 
 
 def frames(

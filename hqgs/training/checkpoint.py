@@ -66,7 +66,7 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]
         raise ValueError(f"the checkpoint {path} is damaged: {error}") from error
     if header.get("format") != str(FORMAT) or "meta" not in header:
         raise ValueError(
-            f"{path} is no checkpoint of this version: format {header.get('format')}, wanted {FORMAT}"
+            f"{path} is not a checkpoint of this version: format {header.get('format')}, wanted {FORMAT}"
         )
     if header.get("crc32") != str(_crc32(header["meta"], tensors)):
         raise ValueError(f"the checkpoint {path} is damaged: its checksum does not match")
@@ -75,7 +75,7 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]
     except (ValueError, RecursionError) as error:
         raise ValueError(f"the checkpoint {path} is damaged: {error}") from error
     if not isinstance(meta, dict):
-        raise ValueError(f"the checkpoint {path} is damaged: its values are no JSON object")
+        raise ValueError(f"the checkpoint {path} is damaged: its values are not a JSON object")
     return tensors, meta
 
 

@@ -96,5 +96,5 @@ def read_plan(path: str | Path) -> Said:
         said: Said = {"iterations": int(plan["iterations"]), "turn": plan["turn"], "timed": True}
         decided(said)
     except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
-        raise ValueError(f"{path} is no plan: {error!r}") from error
+        raise ValueError(f"{path} is not a plan: {error!r}") from error
     return said

@@ -313,7 +313,7 @@ def _outside(path: Path, uri: str) -> bytes:
     name = unquote(uri).replace("\\", "/")
     file = (path.parent / name).resolve()
     if "\0" in name or not file.is_relative_to(path.parent.resolve()):
-        raise ValueError(f"the buffer {uri!r:.80} leaves the folder")
+        raise ValueError(f"the buffer {uri!r:.80} is outside of the folder")
     if not file.is_file():
         raise ValueError(f"the buffer {uri!r:.80} is missing: it belongs beside the file")
     return file.read_bytes()

@@ -100,7 +100,7 @@ def read_transforms(root: Path, downscale: float) -> Capture:
         written = _text(ply, "ply_file_path", root)
         path = files_named(root, [written], "ply_file_path", Named(root, (".ply",))).get(written)
         if path is None or not path.is_file():
-            notes.append(f"ply_file_path {ply!r} names no file in {root}")
+            notes.append(f"ply_file_path {ply!r} is not a file in {root}")
         else:
             points, colors = keep_finite(*read_ply_points(path), notes)
     return Capture("transforms", photos, downscale, points, colors, test_names=test_names, notes=notes)
@@ -174,7 +174,7 @@ def _read_frames(
             mask = _text(mask, "mask_path", where)
             mask_path = files_named(root, [mask], "mask_path", in_masks).get(mask)
             if mask_path is None and os.path.lexists(path):
-                raise FileNotFoundError(f"{where}: mask_path {mask!r} names no file")
+                raise FileNotFoundError(f"{where}: mask_path {mask!r} is not a file")
         try:
             camera = _camera(_by_our_names(meta, frame, where), path, where)
         except UnreadableError:
@@ -227,7 +227,7 @@ def _camera(values: dict[str, Any], path: Path, where: str) -> pycolmap.Camera:
     if width is None or height is None:
         width, height = stored_size(path)
     if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
-        raise ValueError(f"{where}: w, h = {width}, {height} is no photo size")
+        raise ValueError(f"{where}: w, h = {width}, {height} is not a photo size")
     if model == AROUND:
         return around(round(width), round(height))
     kind, distortion = _lens(values, model, where)
@@ -248,8 +248,8 @@ def _pinhole(values: dict[str, Any], width: float, height: float, where: str) ->
     cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
     if 0 < cx <= 1 and 0 < cy <= 1 and min(width, height) > SMALLEST_SIDE:
         raise ValueError(
-            f"{where}: cx, cy = {cx:g}, {cy:g} are shares of w, h = {width:g}, {height:g}: multiply fl_x, "
-            "fl_y, cx and cy by them, px are wanted"
+            f"{where}: cx, cy = {cx:g}, {cy:g} are fractions of w, h = {width:g}, {height:g}: multiply fl_x, "
+            "fl_y, cx and cy by them to get pixels"
         )
     return [either if fx is None else fx, either if fy is None else fy, cx, cy]
 
@@ -265,10 +265,10 @@ def _lens(values: dict[str, Any], model: str, where: str) -> tuple[str, list[flo
     k1, k2, k3, k4, p1, p2 = (_number(values, key, where) or 0.0 for key in order)
     if model in _FISHEYE or values.get("is_fisheye"):
         if p1 or p2:
-            raise ValueError(f"{where}: a fisheye with p1, p2 = {p1}, {p2} is no OpenCV fisheye")
+            raise ValueError(f"{where}: a fisheye with p1, p2 = {p1}, {p2} is not an OpenCV fisheye")
         return "OPENCV_FISHEYE", [k1, k2, k3, k4]
     if k4:  # the one k4 of a perspective camera is r^8 here and a denominator in OpenCV
-        raise ValueError(f"{where}: k4 = {k4} has no agreed meaning for a {model} camera")
+        raise ValueError(f"{where}: k4 = {k4} is not defined for a {model} camera")
     if k3:
         return "FULL_OPENCV", [k1, k2, p1, p2, k3, 0, 0, 0]
     return ("OPENCV", [k1, k2, p1, p2]) if k1 or k2 or p1 or p2 else ("PINHOLE", [])

@@ -76,7 +76,7 @@ def align(source: Floats, target: Floats) -> tuple[Similarity, NDArray[np.bool_]
 
     found = robust(count, 2, fit, residuals)
     if found is None:
-        raise ValueError(f"the {count} cameras of a frame have one centre, which leaves its scale open")
+        raise ValueError(f"the {count} cameras of a frame have one centre, so that its scale is unknown")
     return found
 
 
