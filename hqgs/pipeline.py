@@ -89,38 +89,37 @@ def train(call: TrainCall) -> Run:
         scene: from `hqgs.load`, or made of `hqgs.View` and points.
         out: a folder for checkpoint.safetensors, scene.ply, config.json, report.json, report.html,
             `comparison/*.png`, cameras.json and `photos/*.jpg`; None: nothing is written.
-        iterations: training views to see; None: as many as pay (docs/start.md), at most 30,000.
-        batch: of them in a step: one after the other in one process, shared out by several.
-        seconds: of training, in place of `iterations`: as many as fit in and pay, by the steps of this
-            machine before the run and once more after growth. The rows of its plan, in the report and in
-            plan.json, tell what that came to: a run with that plan makes the same bits again.
-        method: "auto" or "hqgs" (the photos' degradation in the loss, none where they show none), "3dgs" or
+        iterations: training views to render; None: until the scene stops improving, at most 30,000.
+        batch: of them in a step, rendered one after the other, or by several processes.
+        seconds: of training, instead of `iterations`: as many iterations as fit, by the steps that are timed
+            before training and once more after densification. plan.json in the run's folder repeats the
+            result bit for bit.
+        method: "auto" or "hqgs" (the degradation of the photos, if any, is part of the loss), "3dgs" or
             "srgs".
-        leave_out: what the run may do without where the scene does not need it: "auto", "none", or some of
-            photos, growth, resolution, iterations, with commas.
-        seed: of everything random.
-        max_gaussians: growth stops there; bounds the memory.
+        leave_out: what may be left out if the scene does not need it: "auto", "none", or some of photos,
+            growth, resolution, iterations, separated by commas.
+        seed: of all random numbers.
+        max_gaussians: the most Gaussians; limits the memory.
         guidance: of hqgs: "formation", or "paper", its published form.
-        formation: what hqgs takes for the photos' degradation, as `hqgs.degrade` reads it; "auto": it looks.
+        formation: the degradation of the photos, as `hqgs.degrade` reads it; "auto": it is measured.
         eval_every: iterations between evaluations; None: a tenth of the run.
-        config: a `hqgs.TrainConfig`, or what was said of one, as config.json of a run has it; what is said
-            beside it goes over it.
-        resume: go on from the checkpoint in `out`, if there is one, as was said there where nothing else is
-            said; a run that has come to its end goes on where `iterations` is larger, with the schedule of
-            the longer run from there on.
-        overwrite: begin anew in a folder that holds a run.
+        config: a `hqgs.TrainConfig`, or the options of one, as in config.json of a run; other arguments
+            replace its values.
+        resume: continue from the checkpoint in `out`, if there is one, with its options unless others are
+            given. A finished run continues if `iterations` is larger, with the schedule of the longer run.
+        overwrite: start again in a folder that holds a run.
         progress: is called after each step.
-        on_stage: hears what is being done before the first step, and how far it is.
-        ranks: of `hqgs.base.ranks.joined`, where torchrun has started several processes that make the same
+        on_stage: is called with what is done before the first step, and how far it is.
+        ranks: of `hqgs.base.ranks.joined`, if torchrun has started several processes that make the same
             call. The result does not depend on their number; the first one writes and reports.
 
     Raises:
         ValueError: a scene or a setting that cannot be trained, a damaged checkpoint, or one of another run.
-        FileExistsError: `out` holds a run, and neither `resume` nor `overwrite` is set; or files of no run
-            that this one would write over.
+        FileExistsError: `out` holds a run, and neither `resume` nor `overwrite` is set; or other files
+            that the run would overwrite.
         FolderBusyError: another run writes into `out`.
-        TrainingError: the training cannot go on; the message says at which iteration and why.
-        RankError: another of the ranks has failed or gone.
+        TrainingError: training cannot continue; the message says at which iteration and why.
+        RankError: another rank has failed or does not answer.
     """
     ranks, out = call.ranks, None if call.out is None else Path(call.out).expanduser()
     taken = ranks.first and out is not None and (out / CHECKPOINT).exists()

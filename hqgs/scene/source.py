@@ -48,37 +48,36 @@ def load(call: LoadCall) -> Scene:
     """Read a scene into memory: training views, held-out views, pinhole cameras, starting points.
 
     Args:
-        path: a folder of photos alone, or a film: COLMAP finds cameras and points. Or a COLMAP, LLFF,
-            Deblur-NeRF, nerfstudio, instant-ngp or Blender folder, or "embedded", a room that is built in.
-        downscale: divide the photos' sides by this, at least 1 (1).
+        path: a folder of photos without cameras, or a film: COLMAP finds cameras and points. Or a COLMAP,
+            LLFF, Deblur-NeRF, nerfstudio, instant-ngp or Blender folder, or "embedded", a built-in room.
+        downscale: divide width and height of the photos by this, at least 1 (1).
         test_every: hold out each view whose place in the sorted names is a multiple of this (8); 0: none. A
             folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
-        sfm: take cameras and points from the training photos, by COLMAP, in a folder that has its own too.
-        degrade: what happens to the training photos first, as `hqgs.degrade` reads it (none).
+        sfm: find cameras and points from the training photos by COLMAP, even if the folder has some.
+        degrade: how to degrade the training photos, as `hqgs.degrade` reads it (none).
         seed: of the degradation (0).
-        restore: weights of an image network that the training photos go through at last.
-        skip_unreadable: leave out photos that cannot be read, or are of another shape than their camera, as
-            long as half of the photos to train on, and of those held out, remain; `Scene.notes` names them.
-            False: an error (True).
-        cache: a folder that keeps what takes long, for the next call: COLMAP's models, the frames of a film.
+        restore: weights of an image network that restores the training photos, after `degrade`.
+        skip_unreadable: leave out photos that cannot be read, or have another aspect ratio than their
+            camera, as long as half of the training photos, and of the held-out ones, remain; `Scene.notes`
+            names them. False: an error (True).
+        cache: a folder that keeps COLMAP's models and the frames of a film for the next call.
         longest: px; scale the photos down further where a side is longer, or where all photos together
             would take more than 4 GB of memory.
-        coarse: whether COLMAP may look at photos alone coarsely, which is faster, to find their cameras;
-            None: where `longest` is at most 640.
-        frames: how many of a film; None: two a second, 30 to 90.
+        coarse: whether COLMAP uses coarse features only, which is faster; None: if `longest` is at most 640.
+        frames: how many of a film; None: two per second, 30 to 90.
         distance: (A, B, metres) between the cameras of two photos, or points "x,y,z" in the frame of the
-            files: what is written is in metres then.
-        up: x, y, z in the frame of the files; None: as photos or GPS tell it.
-        points: where the files have cameras and no points, let COLMAP find points, and seek up. False, for a
-            scene that is only looked at: random ones, and up as the photos were held.
-        on_stage: hears what is being done, and how far it is.
+            files: files are then written in metres.
+        up: x, y, z in the frame of the files; None: measured in photos or by GPS.
+        points: if the files have cameras but no points, find points by COLMAP, and measure up. False, for a
+            scene that is only shown: random points, and up as the photos were held.
+        on_stage: is called with what is done, and how far it is.
 
     Returns:
         Photos [H, W, 3], sRGB, uint8 (float32 where they were degraded or restored from that); world units
         and frame are those of the files, cameras are in the OpenCV frame.
 
     Raises:
-        FileNotFoundError: a folder, photo or file of weights that is not there.
+        FileNotFoundError: a folder, photo or file of weights is missing.
         ValueError: anything else that is wrong; the message names the file or the photo.
     """
     named = is_room(call.path)
