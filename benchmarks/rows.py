@@ -26,7 +26,7 @@ from hqgs.base.machine import machine_facts, version_facts
 Row = Mapping[str, Any]
 RUN = ("scene", "degradation", "row", "seed", "iterations", "downscale", "poses")  # the key of a training run
 KEYS: dict[str, Sequence[str]] = {  # of each table's lines
-    **dict.fromkeys(("quality", "time", "endurance", "parts"), RUN),
+    **dict.fromkeys(("quality", "time", "endurance", "parts", "looks"), RUN),
     "poses": ("scene", "degradation", "seed", "downscale"),
     "export": ("scene", "file"),
     "accuracy": ("inputs", "knob", "value"),
@@ -62,6 +62,10 @@ TEXT = (
         "digest",
         "start",
         "what",
+        "learned",
+        "gain",
+        "gain_shown",
+        "off",
     ),
 )
 DIGITS = ".7g"

@@ -28,7 +28,11 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, SfmReport
+from hqgs.training.config import run_config
+from hqgs.training.length import seconds_left
 from hqgs.training.methods.base import ThreeDGS
+from hqgs.training.plan import RunPlan
+from hqgs.training.schedule import Schedule
 
 
 @pytest.fixture
@@ -475,34 +479,54 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 def told(clock: list[float], step: float, count: int, length: int, every: int = 0) -> list[tuple[int, str]]:
     """The lines of so many steps of `step` seconds each, with their iterations; evaluated `every` so many."""
     screen, lines = TrainingScreen(), list[tuple[int, str]]()
-    screen.live = False
+    screen.live, say = False, screen.say
     for k in range(1, count + 1):
         clock[0] += step
         done = {"psnr": 20.0, "ssim": 0.5, "views": 2} if every and k % every == 0 else None
-        screen.say = lambda text, k=k: lines.append((k, text))
+        screen.say = lambda text, k=k: (lines.append((k, text)), say(text))[0]
         now: Any = SimpleNamespace(
-            iteration=k, length=length, seconds=k * step, gaussians=9, loss=0.1, evaluated=done
-        )
+            iteration=k, length=length, seconds=k * step, gaussians=9, loss=0.1, evaluated=done,
+            left=lambda k=k: step * (length - k),
+        )  # fmt: skip
         screen(now)
     return lines
 
 
 def test_fast_steps_are_estimated_after_35(clock: list[float]) -> None:
     ((iteration, text),) = told(clock, 0.05, 100, 1000)
-    assert iteration == 36
-    assert text.startswith("1,000 iterations, 20.0 per second now: training takes about 48 s to 2 min")
+    assert iteration == 35
+    assert text.startswith("1,000 iterations; about 48 s left")
 
 
 def test_slow_steps_are_estimated_after_a_few(clock: list[float]) -> None:
     iteration, text = told(clock, 2.0, 12, 30_000)[0]
-    assert iteration == 9  # five to warm up, and five seconds
-    assert "about 16.7 h to 50.0 h" in text
+    assert iteration == 4  # more than five seconds after the first
+    assert "about 16.7 h left" in text
+
+
+@pytest.mark.parametrize(("half", "grows"), [(0, False), (600, False), (0, True), (600, True)])
+def test_what_is_left_follows_from_sizes_and_growth(half: int, grows: bool) -> None:
+    """Of steps that take 1 us for each pixel and Gaussian, 1,000 px and 1,000 Gaussians, 3,000 in the end."""
+    config = run_config(iterations=1000)
+    config = replace(config, densify=replace(config.densify, start=70 if grows else 10**6))
+    schedule = Schedule.of(RunPlan(config, 9, half_size_until=half), 5)
+    stop = config.due.stop
+
+    def step(k: int) -> float:
+        count = 1000 * (1 + 2 * min(k / stop, 1)) if grows else 1000
+        return 1e-6 * (count + (250 if k <= half else 1000))
+
+    state: Any = SimpleNamespace(
+        iteration=50, decisions=schedule.start(), gaussians=range(1000), recent=[step(50)] * 35
+    )
+    truth = sum(step(k) for k in range(51, 1001))
+    assert seconds_left(schedule, state, 1000) == pytest.approx(truth, rel=0.12)
 
 
 def test_a_line_each_minute_with_what_is_left(clock: list[float]) -> None:
     lines = told(clock, 1.0, 200, 1000)[1:]
-    assert [iteration for iteration, _ in lines] == [62, 123, 184]
-    assert lines[0][1] == "iteration 62 of 1000: 9 Gaussians, 62 s, loss 0.100; about 16 min left"
+    assert [iteration for iteration, _ in lines] == [68, 129, 190]
+    assert lines[0][1] == "iteration 68 of 1000: 9 Gaussians, 68 s, loss 0.100; about 16 min left"
 
 
 def test_evaluations_say_on_how_many_views_and_what_is_left(clock: list[float]) -> None:
@@ -533,8 +557,8 @@ def test_before_the_first_step_no_silence_lasts(clock: list[float]) -> None:
     told = [(round(when), text) for when, text in lines]
     assert told == [
         (0, "It takes long."),
-        (7, "COLMAP: features: 3 of 9"),
-        (13, "COLMAP: features: 6 of 9"),
+        (7, "COLMAP: features: 3 of 9, about 12 s left"),
+        (13, "COLMAP: features: 6 of 9, about 6 s left"),
         (19, "COLMAP: features: 9 of 9"),
         (30, "frames: 4"),
     ]

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
+import torch
+from numpy.typing import NDArray
 from run_state import run_until
-from tiny_scene import tiny_scene
+from tiny_scene import tiny_config, tiny_scene
+from torch import Tensor
 
 from hqgs.base.files import CHECKPOINT
+from hqgs.base.stages import Stage
 from hqgs.diagnosis.photo import Finding
 from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.evaluation.held_out import RenderedView
@@ -20,7 +24,7 @@ from hqgs.scene.scene import Scene
 from hqgs.training import prepare, trial
 from hqgs.training.config import TrainConfig, run_config
 from hqgs.training.plan import Facts, RunPlan, StepSeconds, Tried
-from hqgs.training.rules import plan_run
+from hqgs.training.rules import no_growth, plan_run
 from hqgs.training.trainer import Trainer
 
 ASKED = run_config(iterations=1000, method="hqgs", formation="none")
@@ -61,11 +65,16 @@ class FakeRun:
 
     def __init__(self, scene: Scene, config: TrainConfig) -> None:
         self.scene, self.iteration, self.length = scene, 0, config.iterations
-        self.method: Any = SimpleNamespace(state_dict=dict, load_state_dict=lambda state: None)
         self.plan = RunPlan(config, FIRST, True, True, 0, 0, 0)
 
     def begin(self, plan: RunPlan) -> None:
         self.plan, self.iteration = plan, 0
+
+    def branch(self, plan: RunPlan) -> FakeRun:
+        assert 0 < self.iteration == self.plan.settings.due.start < self.length  # where growth starts
+        other = copy(self)
+        other.plan = plan
+        return other
 
     def step(self) -> None:
         self.iteration += 1
@@ -96,25 +105,38 @@ def test_short_runs_are_judged_by_photos_that_they_have_not_seen() -> None:
     plan = RunPlan(replace(ASKED, iterations=10**6, leave_out=("growth",)), FIRST, True, True, 0, 0, 0)
     found = trial.tried_growth(scene, plan, begin)  # type: ignore[arg-type]
     names = [view.name for view in scene.train]
-    for part, offset in zip(seen, trial.OFFSETS, strict=True):
-        assert [view.name for view in part.test] == names[offset :: trial.EACH]
-        assert sorted(view.name for view in (*part.train, *part.test)) == sorted(names)
+    (part,) = seen  # the first photos tell it clearly
+    assert [view.name for view in part.test] == names[trial.OFFSETS[0] :: trial.EACH]
+    assert sorted(view.name for view in (*part.train, *part.test)) == sorted(names)
     assert found is not None
-    assert found.photos == sum(len(part.test) for part in seen)
+    assert found.photos == len(part.test)
     assert found.gain == pytest.approx(20 * np.log10(GAUSSIAN / trial.PIXELS), abs=0.3)  # as errors are
     assert found.error < 0.1
     assert found.sure > 1  # renders without growth are better by each measure
 
 
-def test_a_trial_ends_where_its_first_photos_all_lose_without_growth(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trial, "PIXELS", 10 * GAUSSIAN)  # a run that grows has fewer than one that does not
-    monkeypatch.setitem(globals(), "GAUSSIAN", 10)
+class Unsure(FakeRun):
+    """A trainer of which every second photo held back is better if nothing grows."""
+
+    def held_out(self) -> list[RenderedView]:
+        still = self.plan.settings.due.start >= self.plan.settings.due.stop
+        views, rng = self.scene.test, np.random.default_rng(0)
+        off = [0.1 if still == k % 2 else 0.11 for k in range(len(views))]
+        noise = [by * rng.choice([-1, 1], view.image.shape) for by, view in zip(off, views, strict=True)]
+        renders = [view.image / 255 + by for view, by in zip(views, noise, strict=True)]
+        return [
+            RenderedView(v.name, v.image, r.astype(np.float32)) for v, r in zip(views, renders, strict=True)
+        ]
+
+
+def test_others_are_held_back_where_the_first_photos_do_not_tell() -> None:
     scene, seen = tiny_scene(12), list[Scene]()
     plan = RunPlan(replace(ASKED, iterations=10**6), FIRST, True, True, 0, 0, 0)
-    found = trial.tried_growth(scene, plan, lambda *of: seen.append(of[0]) or FakeRun(*of))  # type: ignore[arg-type]
+    found = trial.tried_growth(scene, plan, lambda *of: seen.append(of[0]) or Unsure(*of))  # type: ignore[arg-type]
+    names = [[view.name for view in part.test] for part in seen]
+    assert names == [[view.name for view in scene.train[k :: trial.EACH]] for k in trial.OFFSETS]
     assert found is not None
-    assert len(seen) == 1
-    assert found.photos == len(seen[0].test)
+    assert found.photos == sum(map(len, names))
     assert not found.pays
 
 
@@ -122,32 +144,45 @@ class FakeLooks(FakeRun):
     """A trainer whose renders are off the photos by what its formation leaves."""
 
     off: ClassVar = {"none": 0.1, "exposure": 0.05, "exposure+vignetting": 0.06, "exposure+response": 0.04}
+    blurred: ClassVar = {"exposure+response": 0.04, "exposure+response+shake": 0.03}
 
-    def held_out(self) -> list[RenderedView]:
-        self.tried = [*getattr(self, "tried", []), self.plan.settings.hqgs.formation]
-        rng, found = np.random.default_rng(0), []
-        for view in self.scene.test:
-            error = self.off[self.tried[-1]] * rng.choice([-1, 1], view.image.shape)
-            found.append(RenderedView(view.name, view.image, (view.image / 255 + error).astype(np.float32)))
-        return found
+    def begin(self, plan: RunPlan) -> None:
+        super().begin(plan)
+        self.tried = [*getattr(self, "tried", []), plan.settings.hqgs.formation]
+
+    def taken(self, number: int) -> NDArray[np.float32]:
+        assert self.iteration == self.length
+        view = self.scene.train[number]
+        assert view.mask is not None
+        hidden = ~view.mask[..., None]
+        assert hidden.mean() == 0.5
+        error = (self.off | self.blurred)[self.tried[-1]] * np.random.default_rng(number).choice(
+            [-1, 1], view.image.shape
+        )
+        return np.where(hidden, view.image / 255 + error, 9.0).astype(np.float32)
 
 
 def test_a_look_is_kept_where_photos_held_back_gain_by_it() -> None:
-    scene, runs = tiny_scene(12), list[FakeLooks]()
+    scene, runs, stages = tiny_scene(24), list[FakeLooks](), list[Stage]()
     train = [replace(view, device="ab"[k % 4 == 1]) for k, view in enumerate(scene.train)]
 
     def begin(part: Scene, config: TrainConfig) -> FakeLooks:
-        assert {view.device for view in part.train} == {view.device for view in part.test} == {"a", "b"}
+        halves = [view for view in part.train if view.mask is not None]
+        assert {view.device for view in part.train} == {view.device for view in halves} == {"a", "b"}
+        assert len(part.train) == (16 if runs else 23)  # some, where each photo must be looked at often
+        assert part.test == []
         runs.append(FakeLooks(part, config))
         return runs[-1]
 
-    asked = replace(ASKED, hqgs=replace(ASKED.hqgs, formation="exposure+vignetting+response+noise:12"))
-    found = trial.tried_looks(replace(scene, train=train), asked, begin)  # type: ignore[arg-type]
-    assert [run.tried for run in runs] == [[*FakeLooks.off]]
+    formation = "exposure+vignetting+response+shake+focus+noise:12"
+    asked = replace(ASKED, hqgs=replace(ASKED.hqgs, formation=formation))
+    found = trial.tried_looks(replace(scene, train=train), asked, begin, stages.append)  # type: ignore[arg-type]
+    assert [run.tried for run in runs] == [[*FakeLooks.off], [*FakeLooks.blurred]]
     assert {name: tried.pays for name, tried in found.items()} == {
-        "exposure": True, "vignetting": False, "response": True,
+        "exposure": True, "vignetting": False, "response": True, "shake": True,
     }  # fmt: skip
     assert found["exposure"].gain == pytest.approx(20 * np.log10(2), abs=0.6)
+    assert {(now.done, now.total) for now in stages} >= {(800, 800), (640, 640)}
     assert trial.tried_looks(scene, ASKED, begin) == {}  # type: ignore[arg-type]
 
 
@@ -238,3 +273,20 @@ def test_a_run_of_seconds_is_tried_when_its_length_is_known(monkeypatch: pytest.
     assert asked_for == []
     trainer.prepared.plan(StepSeconds(0.01, 0.0))
     assert asked_for == [200]
+
+
+def test_a_branch_comes_to_what_a_run_by_its_plan_comes_to() -> None:
+    config = tiny_config(30)
+    still = replace(config, densify=replace(config.densify, **no_growth(config)))
+    scene, ends = tiny_scene(12), list[list[Tensor]]()
+    first, *others = (Trainer(scene, asked) for asked in (config, config, still))
+    while first.iteration < config.due.start:
+        first.step()
+    for run in (first.branch(others[1].plan), first, *others):  # the copy first: neither moves the other
+        while run.iteration < run.length:
+            run.step()
+        ends.append([tensor.detach() for tensor in run.shown().named().values()])
+    assert [len(end[0]) for end in ends] == [len(end[0]) for end in (ends[3], ends[2], ends[2], ends[3])]
+    assert len(ends[2][0]) != len(ends[3][0])
+    for one, other in ((0, 3), (1, 2)):
+        assert all(map(torch.equal, ends[one], ends[other]))

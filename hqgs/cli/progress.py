@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 _NUMBERS_EVERY = 10  # steps between updates of the bar
 _SILENT = 5.0  # s without a line before a run trains, where there is no terminal
 _TOLD_EVERY = 60.0  # s between lines of the training without a terminal
-_WARM_UP, _MEASURED = 5, 30  # steps: before any are timed, and until the time that is left is told,
-_SOON = 5.0  # s of steps after which it is told in any case
-_SLOWER = 3.0  # times as long a step may take when the scene has grown
+_MEASURED, _SOON = 35, 5.0  # steps, or s of them, after which the time that is left is told
 Self = TypeVar("Self", bound="Screen")
 
 
@@ -27,7 +25,7 @@ class Screen:
 
     def __init__(self) -> None:
         from rich.console import Console  # here: --help waits for neither
-        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
         from rich.progress import Progress as Bars
 
         self.console: Console = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -36,12 +34,13 @@ class Screen:
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             TextColumn("{task.fields[more]}"),
         )
         self._bars = Bars(*columns, console=self.console, transient=True, disable=not self.live)
         self._task: TaskID | None = None
         self._said = time.perf_counter()
+        self._work: tuple[str, int, float] = "", 0, 0.0  # of a stage: what, how much was done at first, when
 
     def __enter__(self: Self) -> Self:
         self._bars.start()
@@ -62,18 +61,30 @@ class Screen:
         if stage.note:
             self.say(stage.note)
             return
-        self.show(stage.what, stage.done, stage.total)
+        left = self._left(stage)
+        self.show(stage.what, stage.done, stage.total, left)
         if not self.live and time.perf_counter() - self._said > _SILENT:
             count = f": {stage.done}" if stage.done else ""
-            self.say(f"{stage.what}{count}" + (f" of {stage.total}" if count and stage.total else ""))
+            count += f" of {stage.total}" if count and stage.total else ""
+            self.say(f"{stage.what}{count}{left and f', {left}'}")
 
-    def show(self, what: str, done: int, total: int, more: str = "") -> None:
+    def _left(self, stage: Stage) -> str:
+        """The time that a stage will take, by what it took so far; nothing where that is short."""
+        what, first, began = self._work
+        now = time.perf_counter()
+        if what != stage.what or stage.done < first:
+            self._work = stage.what, stage.done, now
+        elif first < stage.done < stage.total and now - began > 1:
+            return f"about {duration((now - began) * (stage.total - stage.done) / (stage.done - first))} left"
+        return ""
+
+    def show(self, what: str, done: int, total: int, left: str = "", more: str = "") -> None:
         """Where the work is; other words begin another bar."""
         if self._task is None or self._bars.tasks[-1].description != what:
             if self._task is not None:
                 self._bars.remove_task(self._task)
-            self._task = self._bars.add_task(what, total=total or None, more=more)
-        self._bars.update(self._task, completed=done, total=total or None, more=more)
+            self._task = self._bars.add_task(what, total=total or None, left=left, more=more)
+        self._bars.update(self._task, completed=done, total=total or None, left=left, more=more)
 
 
 class LoadingScreen(Screen):
@@ -102,9 +113,7 @@ class TrainingScreen(Screen):
     def __init__(self) -> None:
         super().__init__()
         self._held_out = "not measured yet"
-        self._first: tuple[int, float] | None = None  # iteration and seconds from which on steps are timed
-        self._told = False
-        self._mark: tuple[float, int, float] | None = None  # of the last line: when, iteration, s of training
+        self._steps = 0  # seen
         self.began: float | None = None  # `time.perf_counter` after the first step
         self.ended: float | None = None  # and after the last one
 
@@ -115,42 +124,24 @@ class TrainingScreen(Screen):
         if now.evaluated is not None:
             psnr = now.evaluated["psnr"]
             self._held_out = "no PSNR" if psnr is None else f"{psnr:.2f} dB"
-            self.say(_evaluated(now) + self._left(now))
-        elif self._mark is None:
-            self._mark = self.ended, now.iteration, now.seconds
-        elif not self.live and self.ended - self._mark[0] > _TOLD_EVERY:
+            self.say(_evaluated(now) + _left(now))
+        elif not self.live and self.ended - self._said > _TOLD_EVERY:
             numbers = f"{now.gaussians} Gaussians, {now.seconds:.0f} s, loss {now.loss:.3f}"
-            self.say(f"iteration {now.iteration} of {now.length}: {numbers}{self._left(now)}")
+            self.say(f"iteration {now.iteration} of {now.length}: {numbers}{_left(now)}")
         if now.iteration % _NUMBERS_EVERY == 0 or now.evaluated is not None:
             more = f"held-out {self._held_out}, {now.gaussians:,} Gaussians, loss {now.loss:.3f}"
-            self.show("training", now.iteration, now.length, more)
-        self._estimate(now)
-
-    def _left(self, now: Progress) -> str:
-        """The time that is left, from the steps since the last line."""
-        mark, self._mark = self._mark, (self.ended or 0.0, now.iteration, now.seconds)
-        if mark is None or now.iteration in (mark[1], now.length):
-            return ""
-        step = (now.seconds - mark[2]) / (now.iteration - mark[1])
-        return f"; about {duration(step * (now.length - now.iteration))} left"
-
-    def _estimate(self, now: Progress) -> None:
-        """Once, in the first seconds: how long the run will take here."""
-        if self._told:
-            return
-        if self._first is None:
-            self._first = now.iteration + _WARM_UP, 0.0
-        start, seconds = self._first
-        if not seconds and now.iteration >= start:
-            self._first = now.iteration, now.seconds
-        elif now.iteration >= start + _MEASURED or (now.iteration > start and now.seconds - seconds >= _SOON):
-            self._told = True
-            step, left = (now.seconds - seconds) / (now.iteration - start), now.length - now.iteration
+            self.show("training", now.iteration, now.length, _left(now).removeprefix("; "), more)
+        before, self._steps = self._steps, self._steps + 1
+        if before < _MEASURED and (self._steps == _MEASURED or self.ended - self.began > _SOON):
+            self._steps = _MEASURED
             self.say(
-                f"{now.length:,} iterations, {1 / step:.1f} per second now: training takes about "
-                f"{duration(left * step)} to {duration(_SLOWER * left * step)} (steps slow down as Gaussians "
-                "are added), plus evaluations. Ctrl-C stops at any time and writes the scene"
+                f"{now.length:,} iterations{_left(now)}, plus evaluations. Ctrl-C stops at any time and "
+                "writes the scene"
             )
+
+
+def _left(now: Progress) -> str:
+    return f"; about {duration(now.left())} left" if now.iteration < now.length else ""
 
 
 def duration(seconds: float) -> str:

@@ -116,6 +116,14 @@ class TrainingViews:
         return ForwardPass(plan, view, shot.camera, render, meta, photo, loss, measured, pulls)
 
     @torch.no_grad()
+    def taken(self, gaussians: Gaussians, number: int, degree: int, coarse: bool = False) -> Tensor:
+        """The photo of this number, [H, W, 3], as its camera takes `gaussians`, up to a degree."""
+        view, target = self.target(number, coarse)
+        shot = self.method.shot(view, target)
+        render, _ = render_view(gaussians, shot.camera, degree, self.background, low_pass(coarse))
+        return shot.develop(render)
+
+    @torch.no_grad()
     def psnr(
         self, gaussians: Gaussians, numbers: Sequence[int], degree: int, coarse: bool, ranks: Ranks
     ) -> float:
@@ -124,10 +132,8 @@ class TrainingViews:
         """
 
         def error(number: int) -> float | None:
-            view, target = self.target(number, coarse)
-            shot = self.method.shot(view, target)
-            render, _ = render_view(gaussians, shot.camera, degree, self.background, low_pass(coarse))
-            image = self.method.compare(shot.develop(render), target)
+            target = self.target(number, coarse)[1]
+            image = self.method.compare(self.taken(gaussians, number, degree, coarse), target)
             difference = (image - floats(target.photo)).square()
             if target.mask is not None:
                 difference = difference[target.mask]

@@ -31,10 +31,15 @@ class Progress:
     diagnosis: Diagnosis | None = field(repr=False)  # of the photos; None: the method asked for none
     _step: Step = field(repr=False)
     _model: Callable[[], Gaussians] = field(repr=False)
+    _left: Callable[[], float] = field(repr=False)
 
     def model(self) -> Gaussians:
         """The scene as it is rasterized now; its memory changes with the next step."""
         return self._model()
+
+    def left(self) -> float:
+        """Seconds that the rest of the steps will take, about."""
+        return self._left()
 
     def psnr(self) -> float | None:
         """Of the render against the training photo, dB. None where it is infinite or nothing counts."""
@@ -59,4 +64,5 @@ def progress_of(trainer: Trainer, step: Step, evaluated: HistoryEntry | None) ->
         diagnosis=trainer.diagnosis,
         _step=step,
         _model=trainer.model,
+        _left=trainer.seconds_left,
     )

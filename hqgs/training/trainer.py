@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs.base.left_out import LeftOut
@@ -29,7 +32,7 @@ from hqgs.training.densify import Densifier
 from hqgs.training.forward import Gradients, Step, gradients_of_one
 from hqgs.training.frame import Trainable
 from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, Guard, parameter_fault
-from hqgs.training.length import by_held_photos, by_the_clock
+from hqgs.training.length import by_held_photos, by_the_clock, seconds_left
 from hqgs.training.methods.base import Method
 from hqgs.training.overfitting import decay_opacities
 from hqgs.training.plan import PlanRow, RunPlan, StepSeconds, Tried, left_out_of
@@ -71,6 +74,12 @@ class Trainer:
         if self.iteration or plan.settings.hqgs.formation != self.config.hqgs.formation:
             self.prepared.form(plan.settings, Inspector())
         self._stand(plan)
+
+    def branch(self, plan: RunPlan) -> Trainer:
+        """A copy of this run as it stands, which goes on by another plan of as many steps."""
+        other = copy.deepcopy(self)
+        other.plan, other.schedule = plan, Schedule.of(plan, len(self.scene.train))
+        return other
 
     def _stand(self, plan: RunPlan) -> None:
         self.plan: RunPlan = plan
@@ -127,6 +136,12 @@ class Trainer:
     def length(self) -> int:
         """Iterations of the run, as far as it is known: those of the configuration, or fewer."""
         return self.state.decisions.length
+
+    def seconds_left(self) -> float:
+        """That the rest of the steps will take, about."""
+        cameras = [view.camera for view in self.scene.train]
+        pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
+        return seconds_left(self.schedule, self.state, pixels)
 
     def step(self, coarse: bool | None = None) -> Step:
         """Train on the next views (`Schedule.batch`). `coarse`: at the smaller size; None: as planned."""
@@ -197,6 +212,12 @@ class Trainer:
         learned = {photo.name: photo.look for photo in self.method.learned()}
         looks = looks_of_devices(self.scene.train, learned)
         return HeldOutViews(views, self.model(), degree, self.config.background, looks)
+
+    def taken(self, number: int) -> NDArray[np.float32]:
+        """The training photo of this number, [H, W, 3], as its own camera takes the scene now."""
+        views, degree = self.prepared.training_views, self.schedule.degree(self.iteration)
+        with one_torch_thread():
+            return views.taken(self.shown(), number, degree).numpy()
 
     def evaluate(self, views: HeldOutViews | None = None) -> None:
         """Add the held-out means at this iteration to the history, once. Takes no training time.

@@ -1,0 +1,139 @@
+"""The benchmark `looks`: what photos and cameras do of their own, if it is found, and what learning it gains.
+
+Clean photos, or with a look put on them. What the diagnosis finds is trained with and without, and what was
+put on in any case; a capture in which nothing is found is not trained.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pandas import DataFrame
+
+from benchmarks.command import Benchmark
+from benchmarks.measure import Run
+from benchmarks.pages.figures import number, table
+from benchmarks.protocol import Row, read_protocols
+from benchmarks.rows import pairs_of
+from benchmarks.study import Cell, finished
+from hqgs.diagnosis.scene import Inspector
+from hqgs.evaluation.metrics import psnr_aligned
+from hqgs.photos.formula import LEARNED, NONE, parse_formation
+from hqgs.photos.look import Look
+from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.scene.scene import Scene, View
+from hqgs.training.config import AUTO
+from hqgs.training.frame import Frame
+from hqgs.training.trainer import Trainer
+
+CAMERAS = "a", "b"  # that take photos in turn, where a response is put on
+
+
+@dataclass(frozen=True)
+class Taken(Row):
+    """A look that is put on photos."""
+
+    method: str = AUTO
+    leave_out: str = AUTO
+    put: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def more(self) -> dict[str, Any]:
+        return {"put": self.put}
+
+
+PROTOCOLS = read_protocols(Path(__file__).with_suffix(".toml"), Taken)
+
+
+def put_on(scene: Scene, put: dict[str, float], seed: int) -> tuple[Scene, dict[str, Look]]:
+    """The scene by cameras with these looks, and the look of each of its photos."""
+    rng, looks = np.random.default_rng([seed, 9]), dict[str, Look]()
+
+    def taken(view: View) -> View:
+        device, stops = CAMERAS[len(looks) % 2 if "response" in put else 0], put.get("exposure", 0.0)
+        response = put.get("response", 0.0) * np.array([[1.0] * 3, [0.0] * 3]) * (1 if device == "a" else -1)
+        gains = 2 ** rng.uniform(-stops, stops, 3)
+        looks[view.name] = Look(gains, np.array([put.get("vignetting", 0.0), 0.0]), response)
+        image = to_uint8(looks[view.name].of(as_floats(view.image), view.camera.K).clip(0, 1))
+        return replace(view, image=image, device=device)
+
+    if not put:
+        return scene, looks
+    return replace(scene, train=[*map(taken, scene.train)], test=[*map(taken, scene.test)]), looks
+
+
+def values_of(looks: list[Look], kind: str) -> NDArray[np.float64]:
+    """What one kind of a look does to each photo, as far as photos can tell it."""
+    if kind == "vignetting":
+        return np.array([look.vignetting @ [[0.5, 1.0], [0.25, 1.0]] for look in looks])  # of r^2
+    each = np.array([look.response[0] if kind == "response" else np.log(look.gains) for look in looks])
+    return each - each.mean(0)
+
+
+def measure(cell: Cell, photos: Scene) -> Run:
+    assert isinstance(cell.row, Taken)
+    (scene, looks), inspector = put_on(photos, cell.row.put, cell.seed), Inspector()
+    formation = inspector.diagnose(scene).formation
+    found = [step.kind for step in parse_formation(formation).steps if step.kind in LEARNED]
+    run: Run = {"found": "+".join(found), "learned": "", "psnr": None, "psnr_shown": None}
+    run |= {"gain": {}, "gain_shown": {}, "off": {}}
+    if not found and not cell.row.put:
+        return run
+    plan = Trainer(Frame.of(scene), cell.config, inspector).plan
+    kinds = [str(step) for step in parse_formation(plan.settings.hqgs.formation).steps]
+
+    @cache
+    def trained(formation: str) -> tuple[NDArray[np.float64], list[Look]]:
+        """Held-out PSNR in the look of their camera and, of clean photos, as shown; and what was learned."""
+        asked = replace(cell.config, hqgs=replace(cell.config.hqgs, formation=formation))
+        trainer = Trainer(Frame.of(scene), asked, inspector)
+        while trainer.iteration < trainer.length:
+            trainer.step()
+        values = [
+            [psnr_aligned(view.render, view.photo, view.mask), psnr_aligned(shown, clean.image, view.mask)]
+            for view, clean in zip(trainer.held_out(), photos.test, strict=True)
+            for shown in [view.render if view.shown is None else view.shown]
+        ]
+        return np.array(values, np.float64).mean(0), [photo.look for photo in trainer.method.learned()]
+
+    look, shown = trained("+".join(kinds) or NONE)[0].tolist()
+    run |= {"learned": "+".join(kind for kind in kinds if kind in LEARNED), "psnr": look, "psnr_shown": shown}
+    for kind in dict.fromkeys([*found, *cell.row.put]):
+        others = [one for one in kinds if one != kind]
+        with_it, without = trained("+".join([*others, kind])), trained("+".join(others) or NONE)
+        run["gain"][kind], run["gain_shown"][kind] = (with_it[0] - without[0]).tolist()
+        if kind in cell.row.put:
+            true = values_of([looks[view.name] for view in scene.train], kind)
+            off = np.abs(values_of(with_it[1], kind) - true).mean()
+            run["off"][kind] = float(off / np.abs(true).mean())
+    return run
+
+
+def looks_table(runs: DataFrame) -> str:
+    """A line for each look that is found, or was put on."""
+    heads = ("capture", "photos", "seed", "part", "found", "on", "gain (dB)", "gain as shown (dB)", "off by")
+    body = list[list[str]]()
+    for line in runs.to_dict("records"):
+        gains, shown, off = (dict(pairs_of(line[name])) for name in ("gain", "gain_shown", "off"))
+        start = [line["scene"], line["row"], f"{line['seed']}"]
+        if not gains:
+            body.append([*start, "none", *["–"] * 5])
+        for kind, gain in gains.items():
+            is_in = ["yes" if kind in line[name].split("+") else "no" for name in ("found", "learned")]
+            numbers = [number(gain, "+.2f"), number(shown[kind], "+.2f"), number(off.get(kind), ".0%")]
+            body.append([*start, kind, *is_in, *numbers])
+    return table(heads, body)
+
+
+def run(args: argparse.Namespace) -> list[str]:
+    study, runs = finished(args, PROTOCOLS, measure)
+    return [*([looks_table(runs)] if len(runs) else []), *study.missing()]
+
+
+BENCHMARK = Benchmark("what photos and cameras do of their own: found, learned, gained", run, PROTOCOLS)
