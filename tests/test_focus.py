@@ -16,11 +16,10 @@ import hqgs
 from benchmarks.scenes.wild import wild_room
 from hqgs.diagnosis import focus
 from hqgs.diagnosis.focus import DIFFERS, GOES_WITH_DEPTH, focus_signs
-from hqgs.photos.exposure import take_photo
 from hqgs.photos.formula import parse_formation
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Scene
-from hqgs.training.methods.cameras import lens_warps, samples, sharp_at, widest
+from hqgs.training.methods.cameras import lens_warps, samples, sharp_at, take_photo, widest
 
 SIDE, MARGIN = 41, 8
 

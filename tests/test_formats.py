@@ -20,8 +20,8 @@ from test_spz import angles
 
 from hqgs.cli import main as cli
 from hqgs.model.constants import SH_C0
-from hqgs.model.formats.codebooks import codebook, palette
 from hqgs.model.formats.files import FORMATS as FORMATS_OF_FILES
+from hqgs.model.formats.sog import codebook, palette
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.names import SCENE_SUFFIXES
 from hqgs.scene.paths import look_at

@@ -20,12 +20,11 @@ from hqgs.diagnosis import scene as scene_diagnosis
 from hqgs.diagnosis.colors import UNLIKE_GAINS, log_gains
 from hqgs.diagnosis.differences import TURNED, UNLIKE, unlike_sharpness
 from hqgs.diagnosis.scene import Inspector
-from hqgs.photos.exposure import take_photo
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.scene.geometry import project
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.config import HQGSConfig, run_config
-from hqgs.training.methods.cameras import LearnedCameras
+from hqgs.training.methods.cameras import LearnedCameras, take_photo
 from hqgs.training.trainer import Trainer
 
 SIZE, MARGIN = (14, 17), 3

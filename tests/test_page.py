@@ -18,9 +18,8 @@ from test_ply import random_gaussians
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-from hqgs.show.page.charts import line_chart
 from hqgs.show.page.packing import pack_scene
-from hqgs.show.page.page import Page, page_text, told_verdict
+from hqgs.show.page.page import Page, line_chart, page_text, told_verdict
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,7 @@ from hqgs.base.files import CONFIG, write_json
 from hqgs.base.options import Color
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Measured, check_background, check_out_folder, measured_scene, ready
-from hqgs.evaluation.judge_words import told
-from hqgs.evaluation.verdict import judged_by
+from hqgs.evaluation.verdict import judged_by, judgement
 
 if TYPE_CHECKING:
     from hqgs.evaluation.judge import Judged
@@ -89,7 +88,7 @@ def run(options: Judge) -> int:
 
         write_json(options.out / NUMBERS, found)
         write_judge_page(options.out / PAGE, found, judged)
-    print(told(found))
+    print(judgement(found))
     if options.out is not None:
         print(f"\n{options.out / PAGE}: photos beside renders, and where the errors are")
     return 0

@@ -20,8 +20,8 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.held_out import held_out_renders
 from hqgs.evaluation.intervals import half_width
 from hqgs.evaluation.judge import flat_psnr
-from hqgs.evaluation.judge_words import apart
 from hqgs.evaluation.metrics import psnr
+from hqgs.evaluation.verdict import apart
 from hqgs.model.formats.ply import MOST_LOGIT
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view

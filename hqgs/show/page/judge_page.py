@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hqgs.base.files import write_text
 from hqgs.evaluation.constants import PATCH, SHEET_PHOTOS
 from hqgs.evaluation.judge import Judged
-from hqgs.evaluation.judge_words import (
+from hqgs.evaluation.verdict import (
     CAUSES,
     FORMS,
     LABELS,
@@ -27,8 +27,7 @@ from hqgs.evaluation.judge_words import (
     wrong_frame,
 )
 from hqgs.photos.pixels import png, upright
-from hqgs.show.page.charts import filled
-from hqgs.show.page.page import pair
+from hqgs.show.page.page import filled, pair
 from hqgs.show.trust import WORST_SHOWN
 
 COLORS = ("#d0672a", "#8a5fbf", "#7a7a7a", "#b8c4d0", "#c9b458", "#2f7fc4", "#3f9b57")

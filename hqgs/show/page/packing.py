@@ -28,7 +28,7 @@ import torch
 from numpy.typing import NDArray
 
 from hqgs.model.constants import SH_C0
-from hqgs.model.formats.codebooks import palette
+from hqgs.model.formats.sog import palette
 from hqgs.model.gaussians import Gaussians
 from hqgs.show.export import along_a_curve
 

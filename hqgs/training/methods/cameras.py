@@ -1,8 +1,7 @@
 """What each photo's camera did, learned with the scene: its trajectory in the exposure time, lens and gains;
 and what cameras do to all of their photos, vignetting and response.
 
-One render, warped along the trajectory and over the lens (`hqgs/photos/exposure.py`), stands for the whole
-exposure. What photos cannot tell is fixed by construction: the mean of a trajectory is the photo's pose, the
+One render, warped along the trajectory and over the lens (`take_photo`), stands for the whole exposure. What photos cannot tell is fixed by construction: the mean of a trajectory is the photo's pose, the
 mean of the log gains is that which they start with, that of the responses is 0. Nor can they tell how bright
 the scene is where lenses are dark: it is shown as the mean camera has it (`hqgs.photos.look`), with bright
 corners, and as bright as the photos are in the mean.
@@ -24,16 +23,70 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from hqgs import _rust
 from hqgs.base.elementary import exp
 from hqgs.diagnosis.colors import Devices
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map
-from hqgs.photos.exposure import take_photo
 from hqgs.photos.formation import GOLDEN
 from hqgs.photos.look import MOST_GAIN, Look, as_a_lens, as_responses, darken, falloff, respond, squared_radii
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
+
+
+def take_photo(
+    image: Tensor, size: tuple[int, int], nearness: Tensor | None, warps: Tensor, gains: Tensor
+) -> Tensor:
+    """The photo [H, W, 3] of a render [H + 2 m, W + 2 m, 3] with a margin of m px; sRGB values, white at 1.
+
+    `gains` times the mean over `warps` of the render's light. Each warp [3, 4] is a matrix less the identity
+    that takes a pixel of the photo (x, y, 1, nearness) to where the render shows it, (x, y, 1) times w > 0;
+    pixels' centres lie at halves. Beyond its border the render goes on as it ends.
+
+    Args:
+        image: float32 or float64.
+        size: (H, W).
+        nearness: [H, W], the inverse depth that the warps refer to, of the image's dtype; gets no gradient.
+            None: 0.
+        warps: [K, 3, 4], float64; with K = 0 the picture stands still.
+        gains: [3], float64, of red, green and blue in linear light.
+
+    Raises:
+        ValueError: a wrong shape, dtype or value, with its name.
+    """
+    return _TakePhoto.apply(image, size, nearness, warps, gains)
+
+
+class _TakePhoto(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, size, nearness, warps: Tensor, gains: Tensor) -> Tensor:
+        near = None if nearness is None else nearness.detach().contiguous().numpy()
+        state, photo = _rust.exposure_forward(
+            image.detach().contiguous().numpy(),
+            list(size),
+            near,
+            warps.detach().contiguous().numpy(),
+            gains.detach().tolist(),
+        )
+        ctx.state, ctx.shape = state, image.shape
+        return torch.from_numpy(photo).view(*size, 3)
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's own is too general)
+        ctx: Any, v_photo: Tensor
+    ) -> tuple[Tensor, None, None, Tensor, Tensor]:
+        v_image, v_warps, v_gains = _rust.exposure_backward(ctx.state, v_photo.contiguous().numpy())
+        return (
+            torch.from_numpy(v_image).view(ctx.shape),
+            None,
+            None,
+            torch.from_numpy(v_warps).view(-1, 3, 4),
+            torch.tensor(v_gains, dtype=torch.float64),
+        )
+
 
 # Shares of the run before which trajectories would hide what the scene does not show yet, at which short ones
 # are given up, and of the rates at the end.
