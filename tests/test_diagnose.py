@@ -296,7 +296,7 @@ def test_bad_input_is_named() -> None:
         diagnose_photo(photo[..., 0])
     with pytest.raises(ValueError, match="NaN"):
         diagnose_photo(np.full((64, 64, 3), np.nan, np.float32))
-    with pytest.raises(ValueError, match="272 x 208, larger than its photo 136 x 104"):
+    with pytest.raises(ValueError, match="272 x 208 px, larger than its photo, 136 x 104 px"):
         diagnose_photo(photo[::2, ::2], low=photo)
     with pytest.raises(ValueError, match="max_photos is 0"):
         diagnose_scene(degraded_scene("none", photos=1), max_photos=0)

@@ -1,9 +1,10 @@
 """What each photo's camera did, learned with the scene: its trajectory in the exposure time, lens and gains;
 and what cameras do to all of their photos, vignetting and response.
 
-One render, warped along the trajectory and over the lens (`take_photo`), stands for the whole exposure. What photos cannot tell is fixed by construction: the mean of a trajectory is the photo's pose, the
-mean of the log gains is that which they start with, that of the responses is 0. Nor can they tell how bright
-the scene is where lenses are dark: it is shown as the mean camera has it (`hqgs.photos.look`), with bright
+One render, warped along the trajectory and over the lens (`take_photo`), stands for the whole exposure. What
+photos cannot tell is fixed by construction: the mean of a trajectory is the photo's pose, the mean of the log
+gains is that which they start with, that of the responses is 0. Nor can they tell how bright the scene is
+where lenses are dark: it is shown as the mean camera has it (`hqgs.photos.look`), with bright
 corners, and as bright as the photos are in the mean.
 
 A thin lens is two numbers (slope, offset), px: a point of nearness n, which is its inverse depth with 1 at
