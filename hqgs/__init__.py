@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from hqgs.scene.source import load as load
     from hqgs.show.frames import render_frames as render_frames
     from hqgs.training.config import TrainConfig as TrainConfig
+    from hqgs.training.config import TrainingError as TrainingError
     from hqgs.training.progress import Progress as Progress
-    from hqgs.training.trainer import TrainingError as TrainingError
 
     diagnose = diagnose_scene
 
@@ -56,9 +56,8 @@ _HOMES = {
     "hqgs.scene.scene": "Camera Scene View",
     "hqgs.scene.source": "degrade load",
     "hqgs.show.frames": "render_frames",
-    "hqgs.training.config": "TrainConfig",
+    "hqgs.training.config": "TrainConfig TrainingError",
     "hqgs.training.progress": "Progress",
-    "hqgs.training.trainer": "TrainingError",
 }
 _NAMES = {name.partition(":")[0]: (home, name) for home, names in _HOMES.items() for name in names.split()}
 __all__ = ["__version__", *sorted(_NAMES)]  # pyright: ignore[reportUnsupportedDunderAll]

@@ -61,7 +61,7 @@ def test_a_jpeg_is_decoded_at_a_fraction_and_looks_the_same(tmp_path: Path) -> N
     )
     write_colmap(whole, tmp_path / "png")
     for downscale in (4.3, 11.0):
-        found, wanted = (load_scene(tmp_path / kind, downscale) for kind in ("jpeg", "png"))
+        found, wanted = (load_scene(tmp_path / kind, downscale=downscale) for kind in ("jpeg", "png"))
         for a, b in zip(found.train, wanted.train, strict=True):
             np.testing.assert_array_equal(a.camera.K, b.camera.K)
             assert psnr(a.image, b.image) > 45
@@ -144,7 +144,11 @@ def test_so_many_photos_are_made_smaller(tmp_path: Path, monkeypatch: pytest.Mon
     width, height = scene.train[0].camera.width, scene.train[0].camera.height
     assert note.startswith(f"3 photos of {WIDTH} x {HEIGHT} px are used at {width} x {height} px ")
     assert "so many photos" in note
-    assert load_scene(tmp_path, 1.0).train[0].image.shape == (HEIGHT, WIDTH, 3)  # asked for by its user
+    assert load_scene(tmp_path, downscale=1.0).train[0].image.shape == (
+        HEIGHT,
+        WIDTH,
+        3,
+    )  # asked for by its user
 
 
 def test_few_photos_are_large_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,7 +167,7 @@ def test_few_photos_are_large_at_a_time(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(views, "decode", watched)
     stages: list[Stage] = []
-    scene = load_scene(tmp_path, 4.0, on_stage=stages.append)
+    scene = load_scene(tmp_path, downscale=4.0, on_stage=stages.append)
     assert 1 <= most[0] <= views.MAX_WORKERS
     assert [stage.done for stage in stages if stage.what == "photos read"] == list(range(1, 13))
     for view in [*scene.train, *scene.test]:
@@ -172,7 +176,7 @@ def test_few_photos_are_large_at_a_time(tmp_path: Path, monkeypatch: pytest.Monk
             image = image.base
         assert image.nbytes == 3 * view.camera.width * view.camera.height
     monkeypatch.setattr(views, "MAX_WORKERS", 1)
-    for a, b in zip(scene.train, load_scene(tmp_path, 4.0).train, strict=True):
+    for a, b in zip(scene.train, load_scene(tmp_path, downscale=4.0).train, strict=True):
         np.testing.assert_array_equal(a.image, b.image)
 
 
@@ -191,7 +195,7 @@ def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 load_scene(sys.argv[1], downscale=4.0)
 before = resident()
-scene = load_scene(sys.argv[1], 1.1)
+scene = load_scene(sys.argv[1], downscale=1.1)
 print(resident() - before, sum(view.image.nbytes for view in [*scene.train, *scene.test]))
 """
     done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True)

@@ -30,7 +30,16 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.scene.names import KEPT, is_room
 from hqgs.scene.options import LoadOptions, PhotoOptions
 from hqgs.show.viewer.guard import PORT, check
-from hqgs.training.config import PresetOption, Said, TrainConfig, TrainOptions, decided, longest_side, merged
+from hqgs.training.config import (
+    PresetOption,
+    Said,
+    TrainConfig,
+    TrainingError,
+    TrainOptions,
+    decided,
+    longest_side,
+    merged,
+)
 from hqgs.training.settings import read_plan, read_said, resumed
 
 if TYPE_CHECKING:
@@ -124,7 +133,7 @@ def run(options: Train) -> int:
             return fail(130, "stopped at once; --resume continues from the last checkpoint")
         found = " The same command continues with what COLMAP has found" if (out / KEPT).exists() else ""
         return fail(130, f"stopped before the first checkpoint.{found}")
-    except (hqgs.TrainingError, RankError) as error:
+    except (TrainingError, RankError) as error:
         return fail(1, str(error))
     code = 0 if done.finished else 130
     if not ranks.first:

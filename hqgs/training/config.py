@@ -37,6 +37,10 @@ PART = {"max_gaussians": "densify", "guidance": "hqgs", "formation": "hqgs"}  # 
 LENGTHS = {"iterations", "seconds", "turn", "timed"}  # each says how long a run is, in place of the others
 
 
+class TrainingError(RuntimeError):
+    """The training cannot go on; the message says why and at which iteration."""
+
+
 @dataclass(frozen=True)
 class Preset:
     """How long to train, and on photos of which size."""

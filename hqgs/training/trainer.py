@@ -27,7 +27,7 @@ from hqgs.scene.scene import Scene, View
 from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.batch import gradients_of_several
-from hqgs.training.config import TrainConfig
+from hqgs.training.config import TrainConfig, TrainingError
 from hqgs.training.densify import Densifier
 from hqgs.training.forward import Gradients, Step, gradients_of_one
 from hqgs.training.frame import Trainable
@@ -40,10 +40,6 @@ from hqgs.training.prepare import Prepared
 from hqgs.training.schedule import FINEST, Decisions, Schedule, StepPlan, learning_rates, on_the_way
 from hqgs.training.settings import config_values
 from hqgs.training.state import TrainState
-
-
-class TrainingError(RuntimeError):
-    """The training cannot go on; the message says why and at which iteration."""
 
 
 class Trainer:
