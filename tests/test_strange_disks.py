@@ -267,8 +267,8 @@ def test_links_to_photos_that_were_moved_are_made_anew(
     (kept,) = (folder / "kept").iterdir()
     keep = tmp_path / "kept"
     left = keep / f".{kept.name}"  # as a call that was stopped leaves it
-    for folder in ("photos", "masks"):
-        (left / folder).mkdir(parents=True)
+    for inner in ("photos", "masks"):
+        (left / inner).mkdir(parents=True)
     for k in range(9):
         (left / "photos" / f"{k}.png").symlink_to(tmp_path / "gone" / f"{k}.png")
     again = load_scene(folder / "photos", keep_sfm=keep)
