@@ -353,9 +353,7 @@ def test_the_codec_decides_what_is_left_of_fine_details() -> None:
     details = [[photo.film for photo in found.photos] for found in (good, coarse)]
     assert all(a is not None and b is not None and a > 1.2 * b for a, b in zip(*details, strict=True))
     why = {name: reason for name, _, reason in good.needs()}["video"]
-    assert why.startswith(
-        "3 of 3 photos are told to be frames of a film; as decoded, the finest details are 0."
-    )
+    assert why.startswith("3 of 3 photos are frames of a film; their finest details are 0.")
 
 
 def test_frames_of_a_coarse_film_differ_by_its_codec(monkeypatch: pytest.MonkeyPatch) -> None:
