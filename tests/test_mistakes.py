@@ -38,6 +38,10 @@ MISTAKES = {
     "train scene --out notes.txt": "is a file: name a folder for the run",
     "train scene --out others": "holds config.json, not of a run, which a run would overwrite: name another",
     f"{TRAIN} --overwrte": "there is no option --overwrte - did you mean --overwrite",
+    f"{TRAIN} --foo 1 2": "there is no option --foo (hqgs train --help)",
+    f"{TRAIN} --config.lr-sh0 q": "--config.lr-sh0 is q, wanted a number",
+    "--iterations 3": "there is no option '--iterations'",
+    f"{TRAIN} --device cuda": "there is no --device: hqgs runs on the CPU",
     f"{TRAIN} --gpu": "there is no --gpu: hqgs runs on the CPU; leave this option out",
     f"{TRAIN} --iterations 0": "iterations is 0, wanted at least 1",
     f"{TRAIN} --iterations 1e4": "--iterations is 1e4, wanted a whole number",
@@ -58,6 +62,7 @@ MISTAKES = {
     "view nowhere": "there is no nowhere: give the folder of a run, or a scene file",
     "view photos": "there is no photos/scene.ply: give the folder of a run, or a scene file",
     "view unfinished": "unfinished holds an unfinished run without a scene: hqgs train PHOTOS --out",
+    "view a.ply --port a": "--port is a, wanted a whole number",
     "view a.ply --port 99999": "port is 99999, wanted 0..65535",
     "render a.ply --out film.txt": "film.txt is not a folder; films are .mp4 or .gif, a single picture",
     "render a.ply --out photos": "--out photos holds photos (view_00.png, view_01.png, ",
@@ -66,6 +71,7 @@ MISTAKES = {
     "export a.ply --out a.obj": "unknown suffix; wanted .ply, ",
     "export half.ply --out b.ply": "half.ply: not a PLY file",
     "export a.ply --out b.ply --downscale 2": "--downscale is for the photos of --scene: give",
+    "export a.ply --out b.spz --sh-bits 8 q": "--sh-bits is 8 q, wanted two whole numbers",
     "export a.ply --out b.ply --sh-bits 6 3": "--sh-bits is for spz, and --out b.ply says ply",
     "export a.ply --out b --format glb --spz-version 4": "--spz-version is for spz, and --format says glb",
     "export a.ply --out b.ply --scene photos": "photos has no cameras, and newly found ones would not be in",
@@ -75,6 +81,7 @@ MISTAKES = {
     "render a.ply --out b.png --background 255 0 0": "--background is 255 0 0, wanted three numbers in 0..1",
     "render a.ply --out b.png --background nan 0 0": "--background is nan 0 0, wanted three numbers in 0..1",
     "render a.ply --out b.mp4 --path path.json --up 0 0 1": "--up is for an orbit; a path file has its own",
+    "render a.ply --out b.png --up 0 q 0": "--up is 0 q 0, wanted three numbers",
     "render a.ply --out b.png --up 0 0 0": "up is [0.0, 0.0, 0.0], wanted a direction",
     "render a.ply --out notes.txt/a.gif": "--out notes.txt/a.gif is inside {root}/notes.txt, which",
     "judge a.ply --photos scene --background nan 0 0": "--background is nan 0 0, wanted three numbers in",
@@ -84,6 +91,8 @@ MISTAKES = {
     "plan photos --out nowhere": "--out nowhere: there is no run; leave --out away",
     "clean a.ply --out b.ply": "give --photos, a folder of photos",
     "degrade scene --kind noise:25 --out photos": "photos exists and is not an empty folder",
+    "degrade x --out y --degrade blur:2": "missing: --kind KIND; there is no option --degrade (h",
+    "diagnose x.zip": "there is no scene folder",
     "diagnose nowhere": "there is no scene folder {root}/nowhere",
     "sfm films --out run": "several films: give one of them",
     "sfm photos --out others": "others exists and is not an empty folder",
@@ -133,6 +142,7 @@ def test_a_mistake_is_one_sentence_and_nothing_is_written(
     assert code == 2
     assert all(said.endswith("no camera in EXIF") for said in earlier)  # of photos that were counted
     assert line.startswith("hqgs: ")
+    assert "│" not in line
     assert told.format(root=root) in line
     assert held(root) == before
 

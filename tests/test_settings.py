@@ -180,44 +180,6 @@ def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFix
     check(config_values(TrainConfig()), "--config.")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["train", "x", "--out", "y", "--device", "cuda"], "there is no --device: hqgs runs on the CPU"),
-        (["train", "x", "--out", "y", "--iterations", "many"], "--iterations is many, wanted a whole number"),
-        (["train", "x", "--out", "y", "--foo", "1", "2"], "there is no option --foo (hqgs train --help)"),
-        (
-            ["train", "x", "--out", "y", "--iteratons", "100"],
-            "there is no option --iteratons - did you mean --iterations N",
-        ),
-        (
-            ["degrade", "x", "--out", "y", "--degrade", "blur:2"],
-            "missing: --kind KIND; there is no option --degrade (h",
-        ),
-        (["train", "x", "z", "--out", "y"], "one argument too many: z (hqgs train --help)"),
-        (["train", "x"], "missing: --out DIR"),
-        (["train", "x", "--out", "y", "--preset", "fast"], "--preset is fast, wanted one of: 'quick', "),
-        (["view", "x", "--port", "a"], "--port is a, wanted a whole number"),
-        (["export", "x", "--out", "y", "--sh-bits", "8", "q"], "--sh-bits is 8 q, wanted two whole numbers"),
-        (["render", "x", "--out", "y", "--up", "0", "q", "0"], "--up is 0 q 0, wanted three numbers"),
-        (["train", "x", "--out", "y", "--config.lr-sh0", "q"], "--config.lr-sh0 is q, wanted a number"),
-        (["--iterations", "3"], "there is no option '--iterations'"),
-        (["diagnose", "x.zip"], "there is no scene folder"),
-    ],
-)
-def test_a_mistake_is_one_sentence(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    try:
-        code = main(arguments)
-    except SystemExit as end:
-        code = end.code
-    assert code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert message in line
-    assert "│" not in line
-
-
 def test_each_command_has_help(capsys: pytest.CaptureFixture[str]) -> None:
     for name in COMMANDS:
         with pytest.raises(SystemExit, match="0"):
