@@ -162,18 +162,6 @@ def test_a_folder_that_another_run_holds_stays_as_it_is(
     assert "another run is writing into" in one_line(capsys)
 
 
-def test_the_folder_of_the_photos_is_no_folder_for_a_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "a.jpg").write_bytes(b"")
-    assert call("train", tmp_path, "--out", tmp_path / "." / "") == 2
-    assert (
-        one_line(capsys)
-        == f"hqgs: --out {tmp_path} is the folder of the photos: name another folder for the run"
-    )
-    assert [path.name for path in tmp_path.iterdir()] == ["a.jpg"]
-
-
 def test_what_lies_in_the_folder_of_a_new_run_is_named_or_kept(
     asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -251,20 +239,6 @@ def test_a_run_goes_on_with_resume_only(
     (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
     assert call(*command, "--resume") == 2
     assert f"the checkpoint {tmp_path / CHECKPOINT} is damaged" in one_line(capsys)
-
-
-def test_a_file_in_the_place_of_the_folder_is_bad_input(
-    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("")
-    assert call("train", "embedded", "--out", tmp_path / "file") == 2
-    assert str(tmp_path / "file") in one_line(capsys)
-
-
-def test_unknown_options_are_argparse_errors(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit) as exit_info:
-        call("train", "embedded", "--out", tmp_path, "--method")
-    assert exit_info.value.code == 2
 
 
 def test_a_run_that_cannot_go_on_is_exit_code_1(

@@ -35,6 +35,7 @@ MISTAKES = {
     "train two --out run": "needs at least 3 photos, got 2: 20 to 100 that overlap make a good scene",
     "train scene more --out run": "one argument too many: more",
     "train scene --out scene": "is the folder of the photos: name another folder for the run",
+    "train scene --out others/../scene/.": "is the folder of the photos: name another folder for the run",
     "train scene --out notes.txt": "is a file: name a folder for the run",
     "train scene --out others": "holds config.json, not of a run, which a run would overwrite: name another",
     f"{TRAIN} --overwrte": "there is no option --overwrte - did you mean --overwrite",
