@@ -104,7 +104,7 @@ def test_what_no_pixel_shows_is_left_out_without_a_change_of_a_bit() -> None:
     reduced, left_out = reduce_gaussians(g, ExportOptions("ply", band_tolerance=0.0))
     assert [(item.what, item.why) for item in left_out] == [
         ("1 Gaussians", "their values are NaN or Inf"),
-        ("2 Gaussians", "invisible: opacity below 1/255, or no rotation"),
+        ("2 Gaussians", "invisible (opacity below 1/255, or no rotation)"),
     ]
     kept = torch.tensor([i for i in range(300) if i not in (3, 11, 20)])
     assert torch.equal(reduced.means, g.means[kept])

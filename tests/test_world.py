@@ -254,5 +254,5 @@ def test_a_walk_away_from_most_photos_is_no_mistake(tmp_path: Path) -> None:
     write_transforms(replace(truth, viewmats=viewmats), tmp_path)
     scene = hqgs.load(tmp_path, test_every=0)
     assert len(scene.train) == 9
-    assert not any("lie far" in note for note in scene.notes)
+    assert not any("are far from" in note for note in scene.notes)
     assert scene.extent < 20

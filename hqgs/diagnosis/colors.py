@@ -385,7 +385,7 @@ def device_findings(signs: DeviceSigns | None) -> tuple[Finding, Finding]:
     found: list[Finding] = []
     for name, less, more in zip(DEVICES, (signs.vignetting, signs.response), signs.unbounded, strict=True):
         needed = less >= PAYS[name]
-        reason = f"a {name} for each camera makes photos agree better by {less:.1%}"
+        reason = f"with a {name} for each camera photos would agree better by {less:.1%}"
         reason += "" if needed else f" (needed from {PAYS[name]:.0%})"
         if more >= PAYS[name] and less < more / 2:
             needed = False

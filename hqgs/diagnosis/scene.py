@@ -69,7 +69,7 @@ class Diagnosis:
         ]
         lines += ["", f"{self.scene}: {self.formation}"]
         for name, needed, reason in self.needs():
-            lines.append(f"  {name:11}{'needed    ' if needed else 'not needed'} {reason}")
+            lines.append(f"  {name:11}{'needed    ' if needed else 'not needed'}  {reason}")
         lines += [f"  left out: {item.what}: {item.why}" for item in self.passed_over]
         return "\n".join(lines)
 
@@ -271,7 +271,7 @@ def _blur(photos: Sequence[PhotoDiagnosis]) -> Finding:
     spread = None if _pooled(photos) else _spread_of(amounts)
     if sigma < least:
         blurred = sum(blur.sigma >= least for blur in blurs)
-        reason = f"sigma {sigma:.1f} px is as sharp as good photos (needed from {least:.1f} px)"
+        reason = f"sigma {sigma:.1f} px, as in sharp photos (needed from {least:.1f} px)"
         reason += f"; {blurred} of {len(blurs)} photos are blurred" if blurred else ""
         return Finding("blur", reason, None, sigma, spread)
     name, unit = {

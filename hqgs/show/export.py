@@ -74,7 +74,7 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> tuple[Gaus
     visible = (g.activated_opacities() >= ALPHA_MIN) & (g.quats.square().sum(dim=1) >= QUAT_NORM2_MIN)
     for gone, why in (
         (n - int(finite.sum()), "their values are NaN or Inf"),
-        (int((finite & ~visible).sum()), "invisible: opacity below 1/255, or no rotation"),
+        (int((finite & ~visible).sum()), "invisible (opacity below 1/255, or no rotation)"),
     ):
         left_out += [LeftOut(f"{gone:,} Gaussians", why)] if gone else []
     if left_out:
