@@ -280,7 +280,7 @@ def _report(
     out: Path | None,
 ) -> Report:
     """The report, written into `out`, if there is one; what made it is in `trainer`."""
-    scene, culled = trainer.prepared.given, views.culled()
+    scene = trainer.prepared.given
     rows = [row.known() for row in trainer.rows]
     place, sfm, diagnosis = scene.place, scene.sfm, trainer.diagnosis
     learned = [learned_record(found) for found in trainer.method.learned()]
@@ -295,7 +295,6 @@ def _report(
         "seconds": trainer.seconds,
         "gaussians": len(trainer.gaussians),
         "scene_bytes": None if out is None else (out / PLY).stat().st_size,
-        "culled_in_a_view": sum(culled) / len(culled) if culled else None,
         "peak_rss_mb": peak_rss_mb(),
         "history": trainer.history,
         "left_out": [item.known() for item in left_out],

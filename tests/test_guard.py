@@ -234,11 +234,9 @@ def test_what_the_guard_knows_outlives_a_checkpoint(faulty: Faulty, tmp_path: Pa
 
 
 def test_the_report_of_a_healthy_run(tmp_path: Path) -> None:
-    result = train(tiny_scene(), config=tiny_config(), out=tmp_path)
+    train(tiny_scene(), config=tiny_config(), out=tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["guard"] == {"skipped_steps": 0, "culled_gaussians": 0, "num_events": 0, "events": []}
-    assert report["culled_in_a_view"] == result.report["culled_in_a_view"]
-    assert 0 <= report["culled_in_a_view"] < report["gaussians"]
 
 
 def test_one_look_finds_what_the_rows_would() -> None:

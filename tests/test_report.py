@@ -51,7 +51,6 @@ def result_of(*views: RenderedView, **changes: Any) -> RunResult:
         "scene_bytes": 4321,
         "config": {"iterations": 300, "lr": 1e-3},
         "guard": {"skipped_steps": 0, "culled_gaussians": 0, "num_events": 0, "events": []},
-        "culled_in_a_view": 12.5,
         "world": None,
         "place": None,
         "sfm": None,

@@ -37,7 +37,6 @@ class RenderedView:
     # rounded for the metrics
     render: NDArray[np.float32]
     mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts
-    culled: int | None = None  # Gaussians that this view does not show
     quarter_turns: int = 0  # clockwise, that show it upright
     shown: NDArray[np.float32] | None = None  # [H, W, 3], as the scene is shown; None: as `render`
 
@@ -62,7 +61,6 @@ class HeldOutViews(Sequence[RenderedView]):
         self.names: list[str] = [view.name for view in views]
         self._views, self._gaussians = views, gaussians
         self._sh_degree, self._background = sh_degree, background
-        self._culled: dict[int, int] = {}  # by number of the view, as far as it was rendered
         self._kept: dict[int, RenderedView] = {}  # the one that was asked for last comes last
 
     def __len__(self) -> int:
@@ -82,29 +80,15 @@ class HeldOutViews(Sequence[RenderedView]):
             del self._kept[next(iter(self._kept))]
         return rendered
 
-    def culled(self) -> list[int]:
-        """How many Gaussians each view does not show."""
-        for number in range(len(self)):
-            if number not in self._culled:
-                self[number]
-        return [self._culled[number] for number in range(len(self))]
-
     def _render(self, number: int) -> RenderedView:
         view = self._views[number]
         with one_torch_thread(), torch.no_grad():
-            render, meta = render_view(self._gaussians, view.camera, self._sh_degree, self._background)
-            self._culled[number] = int((meta["radii"][0] == 0).any(dim=1).sum())
+            render, _ = render_view(self._gaussians, view.camera, self._sh_degree, self._background)
         shown = render.numpy()
         look = self._looks.get(view.device)
         taken = shown if look is None else look.of(shown.clip(0), view.camera.K).astype(np.float32)
         return RenderedView(
-            view.name,
-            view.image,
-            taken,
-            view.mask,
-            self._culled[number],
-            view.quarter_turns,
-            shown if self._looks else None,
+            view.name, view.image, taken, view.mask, view.quarter_turns, shown if self._looks else None
         )
 
 

@@ -109,7 +109,7 @@ def judge(
     renders = held_out_renders(judged_scene, gaussians, background=background, looks=looks)
     on_stage(Stage("photos measured", 0, len(views)))
     each = measured(renders)
-    if views and min(renders.culled()) == len(gaussians):
+    if views and not shown_by(gaussians, [view.camera for view in views]).any():
         raise ValueError(
             f"{name}: none of its {len(gaussians):,} Gaussians is in front of any camera of {scene.name}: "
             "the photos' cameras are in another frame than the scene file"

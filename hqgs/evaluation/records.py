@@ -85,7 +85,6 @@ class RunRecord(TypedDict):
     seconds: float  # training time, without loading and without the report
     gaussians: int
     scene_bytes: int | None  # of scene.ply; None: nothing was written
-    culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean
     peak_rss_mb: float | None
     history: list[HistoryEntry]
     left_out: list[LeftOutRecord]
