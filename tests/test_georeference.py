@@ -229,7 +229,7 @@ def test_a_distance_that_cannot_be_is_told(
 ) -> None:
     root = write_colmap(make_truth(), tmp_path / "scene", binary=False)
     with pytest.raises(ValueError, match=words):
-        hqgs.load(root, distance=given)
+        hqgs.load(root, distance=given)  # pyright: ignore[reportArgumentType]
 
 
 def test_photos_from_one_place_have_no_distance(tmp_path: Path) -> None:
