@@ -31,7 +31,7 @@ from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import Said, TrainConfig, TrainOptions, decided, merged
 from hqgs.training.frame import Frame
-from hqgs.training.notes import learned_record, photo_record, run_notes
+from hqgs.training.notes import fell_short, learned_record, photo_record, run_notes
 from hqgs.training.plan import essential
 from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values, plan_values, resumed, said_by
@@ -308,6 +308,9 @@ def _report(
         "config": asdict(config.fitted()),
         "plan": rows,
     }
+    if fell := fell_short(trainer):
+        record["notes"].insert(0, fell)
+        record["fallen"] = fell
     if out is not None and config.seconds is not None:
         write_json(out / PLAN, plan_values(config, rows))
     result = RunResult(record, views)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 import hqgs
 from benchmarks.scenes.room.shading import render_view
 from benchmarks.scenes.sparse import sparse_cameras
 from hqgs.scene.axes import TURNED, with_true_axes
+from hqgs.scene.capture import Capture, Photo, no_points
 from hqgs.scene.scene import View
 
 
@@ -42,14 +46,19 @@ def test_axes_of_transforms_json(opencv: bool, tmp_path: Path) -> None:
     assert len(said) == opencv
 
 
+def capture_of(views: Sequence[View], points: NDArray[np.float64], colors: NDArray[np.uint8]) -> Capture:
+    """As a reader of transforms.json hands it over."""
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0.5, 0.5])
+    photos = [Photo(view.name, Path(view.name), camera, view.camera.viewmat) for view in views]
+    return Capture("transforms", photos, 1.0, points, colors)
+
+
 def test_photos_that_do_not_match_tell_nothing() -> None:
     rng = np.random.default_rng(0)
     noise = [
         View(view.name, view.camera, rng.integers(0, 256, view.image.shape, dtype=np.uint8))
         for view in views()
     ]
-    kept, note = with_true_axes(noise)
-    assert note is None
-    assert kept == noise
-    assert with_true_axes([]) == ([], None)
-    assert with_true_axes(noise[:1])[1] is None
+    for some in (noise, [], noise[:1]):
+        capture = capture_of(some, *no_points())
+        assert with_true_axes(capture, some) == (capture, None)

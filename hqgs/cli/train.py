@@ -262,7 +262,7 @@ def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:
     psnr, name = judged_by(done.report)
     word, why = verdict(psnr, done.report["metrics"])
     print(f"quality: {word} ({why})" + ("" if psnr in (None, last["psnr"]) else f"; {psnr:.2f} dB {name}"))
-    if fell := overdone(done.history):
+    if fell := done.report.get("fallen") or overdone(done.history):
         print(fell)
     print(f"time: {times.told(colmap)}")
     print(f"to share: {out / PAGE} opens in any browser; {VIEWERS} open {out / PLY}")

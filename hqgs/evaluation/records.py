@@ -78,6 +78,7 @@ class RunRecord(TypedDict):
     scene: str
     source: str  # format the scene was read from
     notes: list[str]  # what a reader should know of photos and points
+    fallen: NotRequired[str]  # that it ends far below where it began, and the likely cause
     method: str
     seed: int
     iterations: int

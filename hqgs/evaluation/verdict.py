@@ -175,6 +175,7 @@ _LEVELS = (
     (25.0, "fair", "20 to 25 dB: the scene is recognisable but soft; train longer or take more photos"),
     (30.0, "good", "25 to 30 dB: details are visible"),
 )
+_FAR_BELOW = 1.0  # dB: by as much no two seeds of a run differ, nor what a photo's exposure does
 _BEST = ("very good", "above 30 dB: at a glance it looks like the photo")
 
 
@@ -214,6 +215,27 @@ def overdone(history: Sequence[HistoryEntry]) -> str | None:
         f"training was too long: held-out photos were best after iteration {iteration:,}, {fall:.1f} dB "
         "better than at the end"
     )
+
+
+def fallen(psnr: float | None, flat: float | None, first: float | None) -> str | None:
+    """What to say of a run that ends far below where it began; None: nothing.
+
+    PSNR, dB, of the same views: at the end, of one flat picture of their mean colour, and of the first
+    Gaussians.
+    """
+    if psnr is None:
+        return None
+    if flat is not None and psnr < flat - _FAR_BELOW:
+        return (
+            f"renders are farther from the photos than one flat colour is ({psnr:.1f} dB, {flat:.1f} dB): "
+            "the poses, or the points, are not those of these photos"
+        )
+    if first is not None and psnr < first - _FAR_BELOW:
+        return (
+            f"the run ends below its first step ({psnr:.1f} dB, {first:.1f} dB): the photos contradict each "
+            "other, by wrong poses, by motion, or by exposures that differ"
+        )
+    return None
 
 
 def judged_by(report: Mapping[str, Any]) -> tuple[float | None, str]:

@@ -28,8 +28,6 @@ KEPT_SIDE = 800  # px, of the photos beside cameras.json: to look at, not to tra
 SHOWN = 0.02  # of a photo's sides, which its points must span, and of a face, which its photo must show
 SMALLEST, GREATEST, USUAL = 0.25, 256.0, 4.0  # sizes, world units: ordinary ones; what others are brought to
 ONE_PLACE = 1e-12  # of the distance from the origin: what differs by less is in one place, but for rounding
-AXES_PAIRS = 6  # of neighbours, spread over the photos
-AXES_FEWEST, AXES_CLEAR = 30, 3  # matches that must fit; times as many as with the stated axes
 BACKGROUND = (0.0, 0.0, 0.0)  # RGB behind everything, in renders and cut-out photos, unless asked for
 EMPTY = 255  # of `View.empty`: nothing of the pixel shows anything
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hqgs.base.files import atomic_path
 from hqgs.base.stages import OnStage, Stage, silent
-from hqgs.scene.random_points import NO_POINTS
+from hqgs.scene.random_points import FEWEST, NO_POINTS, too_few
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.run import key_of
 from hqgs.scene.sfm.triangulated import SparsePoints, triangulated
@@ -21,12 +21,13 @@ TOO_SMALL = 100  # px of the photos, below which COLMAP finds no points
 def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent) -> Scene:
     """The scene with points of its training photos, and which photo sees which, in place of random ones.
 
-    As it is where its points are its own, photos are tiny, or COLMAP finds too few; a note says why.
+    As it is where it has points enough of its own, photos are tiny, or COLMAP finds too few; a note says why.
     `keep`: a folder for what is found.
     """
     views = scene.train
     sides = [min(view.camera.width, view.camera.height) for view in views]
-    if not scene.guessed or len(views) < 2 or min(sides) < TOO_SMALL:
+    own = not scene.guessed and len(scene.points) >= FEWEST
+    if own or len(views) < 2 or min(sides) < TOO_SMALL:
         return scene
     on_stage(Stage("COLMAP: points for the given cameras", 0, 0))
     file = None if keep is None else keep / f"points-{key_of('points', _pieces(scene))}.npz"
@@ -52,7 +53,7 @@ def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = sile
         point_colors=found.colors,
         seen=seen,
         guessed=False,
-        notes=[*notes, f"{NO_POINTS}: {found.note}"],
+        notes=[*notes, f"{too_few(scene)}: {found.note}"],
     )
 
 

@@ -17,7 +17,7 @@ from hqgs.photos import profiles
 from hqgs.photos.files import UnreadableError, stored_size, told_colors
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene import masks
-from hqgs.scene.axes import with_true_axes
+from hqgs.scene.axes import unseen, with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, odd_lenses, photo_folder
 from hqgs.scene.checks import broken, elsewhere, nothing
 from hqgs.scene.constants import BACKGROUND, COPY_SIDE, MOST_BYTES, TEST_EVERY
@@ -31,7 +31,7 @@ from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.names import existing_folder
 from hqgs.scene.options import LoadOptions
 from hqgs.scene.place import cut_outs, located, placed, without_missing, without_poseless, without_strays
-from hqgs.scene.random_points import random_points
+from hqgs.scene.random_points import with_first_points
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import Search, read_photos
@@ -80,30 +80,24 @@ def load_scene(asked: FolderCall) -> Scene:
         notes += profiles.told({photo.name: told_colors(photo.path) for photo in capture.photos})
     held_out = held_out_names(root, capture, test_every, notes, degraded)
     capture = without_poseless(root, without_missing(root, capture, notes), notes)
-    capture = placed(without_strays(capture, notes), notes)
     capture = replace(capture, photos=masks.with_turns(capture.photos, notes))
-    views = _views(root, capture, asked, degraded if downscale == 1 else None, held_out, notes)
-    train = [view for view in views if view.name not in held_out]
-    points, colors = capture.points.astype(np.float64), capture.point_colors
-    if guessed := len(points) == 0:
-        points, colors, note = random_points(train, capture.near_far)
-        notes.append(note)
-    if (place := located(capture)) is not None:
-        notes.append(str(place))
-    return Scene(
+    capture, views = _views(root, capture, asked, degraded if downscale == 1 else None, held_out, notes)
+    place = located(capture)
+    scene = Scene(
         root.name,
-        train,
+        [view for view in views if view.name not in held_out],
         [view for view in views if view.name in held_out],
-        points,
-        colors,
+        capture.points.astype(np.float64),
+        capture.point_colors,
         capture.source,
         notes,
         _tracks(capture, views),
         capture.seen,
         capture.sfm,
         world=replace(capture.world, place=place),
-        guessed=guessed,
     )
+    scene = scene if len(scene.points) else with_first_points(scene, capture.near_far)
+    return scene if place is None else replace(scene, notes=[*scene.notes, str(place)])
 
 
 def _views(
@@ -113,24 +107,33 @@ def _views(
     degraded: DegradedFolder | None,
     held_out: frozenset[str],
     notes: list[str],
-) -> list[View]:
-    """The photos, decoded; `degraded`: where small ones are. `notes` hears of those that cannot be used.
+) -> tuple[Capture, list[View]]:
+    """The capture in its frame, without strays, and its photos, decoded; `degraded`: where small ones are.
+    `notes` hears of what was turned, and of photos that cannot be used.
 
     ValueError where too few are left to train on, or to measure with.
     """
-    names = frozenset(photo.name for photo in capture.photos)
-    optional = names if asked.skip_unreadable else frozenset[str]()
+    optional = frozenset(photo.name for photo in capture.photos if asked.skip_unreadable)
     over = BACKGROUND if cut_outs(capture) else None
     views, unreadable = load_views(capture.photos, capture.downscale, optional, asked.on_stage, over)
+    capture, turned = with_true_axes(capture, views)
+    notes += [] if turned is None else [turned]
+    capture = placed(without_strays(capture, notes), notes)
+    poses = {photo.name: photo.viewmat for photo in capture.photos}
+    views = [
+        replace(view, camera=replace(view.camera, viewmat=poses[view.name]))
+        for view in views
+        if view.name in poses
+    ]
+    names = frozenset(poses)
     if any(view.empty is not None for view in views):
         notes.append(
             f"the {len(views)} photos have transparent pixels, which are black in photos and renders"
         )
     if degraded is not None:
         views = _with_lows(views, degraded, root, optional, unreadable)
-    if capture.source == "transforms" and not len(capture.points):
-        views, turned = with_true_axes(views)
-        notes += [] if turned is None else [turned]
+    if capture.source != "photos":
+        notes += unseen(views, capture.points)
     if not names - held_out:
         raise ValueError(f"{root}: all {len(views)} photos are held out, none is left to train on")
     for those, what in ((names - held_out, "training"), (names & held_out, "held-out")):
@@ -142,7 +145,7 @@ def _views(
                 f"{len(gone)} of {len(those)} {what} photos cannot be used and were left out: "
                 f"{some(sorted(gone))}. The first: {gone[min(gone)]}"
             )
-    return views
+    return capture, views
 
 
 def coarsely(longest: int | None, coarse: bool | None = None) -> bool:

@@ -59,12 +59,6 @@ def without_poseless(root: Path, capture: Capture, notes: list[str]) -> Capture:
             f"{root}: all {len(found.photos)} photos have the same pose, which cannot be right; `--sfm` "
             "finds poses"
         )
-    centers = _centers(found)
-    if len(centers) > 2 and np.ptp(centers, axis=0).max() <= ONE_PLACE * np.abs(centers).max():
-        notes.append(
-            f"all {len(centers)} cameras are at the same place, so distances are unknown: are the poses "
-            "inverted (world to camera instead of camera to world)?"
-        )
     return found
 
 
@@ -102,8 +96,19 @@ def cut_outs(capture: Capture) -> bool:
     return all(is_cut_out(photo.path) is not False for photo in photos)
 
 
+def in_one_place(capture: Capture) -> bool:
+    """Whether all of more than two cameras stand where the first does, but for rounding."""
+    centers = _centers(capture)
+    return len(centers) > 2 and bool(np.ptp(centers, axis=0).max() <= ONE_PLACE * np.abs(centers).max())
+
+
 def placed(capture: Capture, notes: list[str]) -> Capture:
     """The capture near the origin and of an ordinary size; `notes` says in which frame, if in another."""
+    if in_one_place(capture):
+        notes.append(
+            f"all {len(capture.photos)} cameras are at the same place, so distances are unknown: are the "
+            "poses inverted (world to camera instead of camera to world)?"
+        )
     world = world_for(_centers(capture), capture.points)
     if world.ordinary:
         return capture

@@ -2,21 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.scene.constants import EMPTY
 from hqgs.scene.geometry import unproject
 from hqgs.scene.paths import sight_lines
-from hqgs.scene.scene import View
+from hqgs.scene.scene import Scene, View
 
 RANDOM_POINTS = 20_000  # to start from where a scene has none
 
 NO_POINTS = "no points in the scene"
+FEWEST = 4  # to start from: each takes its size from three neighbours
+
+
+def with_first_points(scene: Scene, near_far: Mapping[str, tuple[float, float]] | None = None) -> Scene:
+    """The scene with `random_points` in place of its own, where those are fewer than FEWEST."""
+    if len(scene.points) >= FEWEST:
+        return scene
+    points, colors, note = random_points(scene.train, near_far or {})
+    notes = [*scene.notes, f"{too_few(scene)}: {note}"]
+    return replace(scene, points=points, point_colors=colors, notes=notes, seen=None, guessed=True)
+
+
+def too_few(scene: Scene) -> str:
+    """What to say of a scene with fewer points than FEWEST."""
+    few = "" if scene.guessed or not len(scene.points) else f" but {len(scene.points)}, too few to start from"
+    return NO_POINTS + few
 
 
 def random_points(
-    views: list[View], near_far: dict[str, tuple[float, float]]
+    views: list[View], near_far: Mapping[str, tuple[float, float]]
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], str]:
     """Seeded random points in the frusta of the training `views`, coloured by the pixel they were drawn at.
 
@@ -45,7 +64,7 @@ def random_points(
         raise ValueError("the masks hide every pixel of every training view")
     depths = "a guessed depth range" if guessed else "the given depth bounds"
     note = (
-        f"{NO_POINTS}: {RANDOM_POINTS} random points within {depths} of the training views; "
+        f"{RANDOM_POINTS} random points within {depths} of the training views; "
         "`--sfm` finds cameras and points from the photos"
     )
     return np.concatenate(points), np.concatenate(colors), note

@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from hqgs.base.elementary import on_grid
 from hqgs.model.formats.turned import mapped
 from hqgs.model.gaussians import Gaussians
+from hqgs.scene.axes import unseen
 from hqgs.scene.constants import USUAL
+from hqgs.scene.random_points import with_first_points
 from hqgs.scene.scene import Scene, View
 from hqgs.scene.world import World, middle_and_size
 
@@ -41,8 +43,10 @@ class Frame:
 
     @classmethod
     def of(cls, scene: Scene) -> Frame:
-        """ValueError where the scene has no training view."""
+        """ValueError where the scene has no training view, or none of them shows a point."""
         scene.check_trainable()
+        scene = with_first_points(scene)
+        unseen(scene.train, scene.points)
         axes = scene.train[0].camera.viewmat[:3, :3]
         centers = np.stack([view.camera.center for view in scene.train])
         middle, size = middle_and_size(_turned(centers, axes), _turned(scene.points, axes))

@@ -2,14 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from hqgs.base.evenly import evenly
 from hqgs.diagnosis.photo import PhotoDiagnosis
+from hqgs.evaluation.held_out import HeldOutViews, held_out_means
+from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.records import LearnedRecord, PhotoRecord
-from hqgs.evaluation.verdict import overdone
+from hqgs.evaluation.verdict import fallen, overdone
+from hqgs.model.gaussians import Gaussians
+from hqgs.photos.pixels import as_floats
 from hqgs.training.methods.cameras import LearnedCamera
 from hqgs.training.rules import MOST_ITERATIONS
 from hqgs.training.trainer import Trainer
+
+_POOR, _ASKED = 20.0, 4  # dB, above which no run has failed; photos that are asked
+
+
+def fell_short(trainer: Trainer) -> str | None:
+    """What to say of a poor run that ends far below where it began; see `fallen`."""
+    last = trainer.history[-1]["psnr"] if trainer.history else None
+    if last is not None and last > _POOR:
+        return None
+    scene, background = trainer.prepared.given, trainer.config.background
+    views = scene.test or scene.train
+    asked = [views[k] for k in evenly(len(views), _ASKED)]
+    first = Gaussians.from_points(scene.points, scene.point_colors, 0)
+    ends = HeldOutViews(asked, trainer.model(), trainer.schedule.degree(trainer.iteration), background)
+    photos = [as_floats(view.image)[... if view.mask is None else view.mask].reshape(-1, 3) for view in asked]
+    color = np.concatenate(photos).mean(0)
+    flats = [replace(end, render=np.broadcast_to(color, end.photo.shape)) for end in ends]
+    of = (ends, flats, HeldOutViews(asked, first, 0, background))
+    return fallen(*(held_out_means([psnr], renders)[0] for renders in of))
 
 
 def run_notes(trainer: Trainer) -> list[str]:
