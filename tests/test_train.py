@@ -187,7 +187,7 @@ def test_a_run_that_stays_not_finite_ends_with_the_reason(probe: Probe) -> None:
     probe.at = {step: lambda loss: loss * torch.nan for step in range(4, 100)}
     trainer = Trainer(tiny_scene(), tiny_config(100, method="probe", densify=ONLY_TRAIN))
     expected = (
-        f"not finite in {MAX_SKIPPED_IN_A_ROW} steps in a row, up to iteration {MAX_SKIPPED_IN_A_ROW + 3}"
+        f"NaN or Inf in {MAX_SKIPPED_IN_A_ROW} steps in a row, up to iteration {MAX_SKIPPED_IN_A_ROW + 3}"
     )
     with pytest.raises(TrainingError, match=expected):
         steps(trainer, 100)
