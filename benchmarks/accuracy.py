@@ -18,7 +18,7 @@ from torch import Tensor
 from benchmarks.command import TIMED, Benchmark, sizes_of
 from benchmarks.measure import Training
 from benchmarks.pages.figures import listed
-from benchmarks.pages.rasterizing import unbeaten_default
+from benchmarks.pages.sections import unbeaten_default
 from benchmarks.patches import Knobs, tuned
 from benchmarks.protocol import Row, read_toml
 from benchmarks.rows import Table, facts

@@ -18,7 +18,7 @@ import hqgs
 from benchmarks import cli
 from benchmarks.accuracy import CASES, ORACLES, Knobs, TunedPass, errors_against
 from benchmarks.pages.figures import unbeaten
-from benchmarks.pages.rasterizing import unbeaten_default
+from benchmarks.pages.sections import unbeaten_default
 from benchmarks.rows import Table
 from benchmarks.speed.inputs import make_inputs
 from benchmarks.speed.rasterizer import RasterPass

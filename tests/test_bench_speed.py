@@ -16,7 +16,7 @@ from replay import blended_counts, random_pixels
 
 import hqgs
 from benchmarks import cli
-from benchmarks.pages.rasterizing import power
+from benchmarks.pages.sections import power
 from benchmarks.rows import Table, pairs_of
 from benchmarks.speed.inputs import make_inputs
 from benchmarks.speed.rasterizer import RasterPass, count_work

@@ -12,7 +12,7 @@ from typing import Any
 import hqgs
 from benchmarks.command import TIMED, Benchmark, UnavailableError, sizes_of
 from benchmarks.pages.figures import listed, pick
-from benchmarks.pages.rasterizing import power, stages_table, threads_tables
+from benchmarks.pages.sections import power, stages_table, threads_tables
 from benchmarks.protocol import read_toml
 from benchmarks.rows import Table, facts
 from benchmarks.speed.inputs import RasterInputs, fitted, make_inputs

@@ -15,7 +15,7 @@ import torch
 import hqgs
 from benchmarks.command import Benchmark
 from benchmarks.pages.figures import records
-from benchmarks.pages.rasterizing import families
+from benchmarks.pages.sections import families
 from benchmarks.rows import Table, facts
 from benchmarks.stability.cases import Case, cases
 from benchmarks.stability.oracle import GROUPS, KINDS, Array, Oracle, OracleScene, Pixel, load_mpmath
