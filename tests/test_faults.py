@@ -387,7 +387,7 @@ def test_a_folder_that_cannot_be_written_is_bad_input(processes: ForkServerConte
             assert child.exitcode == 2, (command, stderr.read_text())
             lines = stderr.read_text().splitlines()
             assert len(lines) == 1, lines
-            assert "no right to" in lines[0]
+            assert "no permission" in lines[0]
             assert out in lines[0]
             stderr.unlink()
         assert list((root / "out").iterdir()) == []

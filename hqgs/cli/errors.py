@@ -20,8 +20,8 @@ BAD_INPUT = (
 
 _WORDS = {
     errno.EEXIST: "exists already: choose another name",
-    errno.EACCES: "cannot be read or written: you have no right to",
-    errno.EPERM: "cannot be read or written: you have no right to",
+    errno.EACCES: "cannot be read or written: no permission",
+    errno.EPERM: "cannot be read or written: no permission",
     errno.ENOENT: "is not there",
     errno.ENOTDIR: "is inside a file, not a folder",
     errno.EISDIR: "is a folder, wanted a file",
