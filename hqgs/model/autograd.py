@@ -210,8 +210,9 @@ class _Composite(torch.autograd.Function):
             ctx.expected = image[..., -1:].copy(), alphas.copy()
         ctx.state, ctx.behind, ctx.mode, ctx.absgrad, ctx.which = state, behind, mode, absgrad, which
         ctx.shape = c, n, channels.shape[-1]
-        ctx.save_for_backward(means2d if packed is None else packed, colors)
-        ctx.image_shape = image.shape
+        if absgrad:
+            ctx.save_for_backward(means2d if packed is None else packed)
+        ctx.image_shape, ctx.dtype, ctx.of_each = image.shape, image.dtype, colors.dim() == 3
         ctx.set_materialize_grads(False)
         return torch.from_numpy(image), torch.from_numpy(alphas), state.work
 
@@ -219,14 +220,13 @@ class _Composite(torch.autograd.Function):
     @first_derivative
     def backward(ctx: Any, *grads):
         v_image, v_alphas, _ = grads
-        means2d, colors = ctx.saved_tensors
         _, *needs = ctx.needs_input_grad[:8]
         need_means2d, _, need_link, need_alphas, need_colors, need_depths, need_backgrounds = needs
         geometry = need_means2d or need_link or need_alphas
         if v_image is None and v_alphas is None:
             return (None,) * 11
         c, n, channels = ctx.shape
-        v_image = np.zeros(ctx.image_shape, as_array(means2d).dtype) if v_image is None else as_array(v_image)
+        v_image = np.zeros(ctx.image_shape, ctx.dtype) if v_image is None else as_array(v_image)
         v_alphas = _optional(v_alphas)
         if ctx.expected is not None:
             v_image, v_alphas = _of_accumulated(ctx.expected, v_image, v_alphas)
@@ -241,7 +241,8 @@ class _Composite(torch.autograd.Function):
             v_packed, v_means2d = ctx.which.of(v_means2d), None
             v_abs = ctx.which.of(v_abs)
         if v_abs is not None:
-            means2d.absgrad = v_abs
+            (positions,) = ctx.saved_tensors
+            positions.absgrad = v_abs
         v_color, v_depths = _tensor(v_colors, c, n, channels), None
         v_background = _tensor(v_backgrounds, c, channels)
         if v_background is not None and ctx.mode != "RGB":
@@ -249,7 +250,7 @@ class _Composite(torch.autograd.Function):
         if v_color is not None and ctx.mode != "RGB":
             v_depths = v_color[..., -1].contiguous() if need_depths else None
             v_color = v_color[..., :-1].contiguous() if need_colors else None
-        if v_color is not None and colors.dim() == 2:
+        if v_color is not None and not ctx.of_each:
             v_color = v_color[0] if c == 1 else v_color.sum(0)
         v_link, v_alphas_in = _tensor(v_link, c, n, 3), _tensor(v_alphas_in, c, n)
         splats = None, v_means2d, v_packed, v_link, v_alphas_in

@@ -13,6 +13,7 @@ from torch.optim import Optimizer
 
 from hqgs import _rust
 from hqgs.evaluation.records import GuardEvent, GuardRecord
+from hqgs.model.autograd import as_array
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
 
@@ -116,8 +117,7 @@ def parameter_fault(gaussians: Gaussians, rows_changed: bool) -> Fault | None:
 
 def are_sound(tensors: Iterable[tuple[str, Tensor]], **limits: float) -> bool:
     """Whether no value is NaN, Inf or beyond GUARD_LIMIT (or one of `limits`); float32 or float64."""
-    arrays = ((name, tensor.detach().contiguous().numpy()) for name, tensor in tensors)
-    return _rust.all_below([(array, limits.get(name, GUARD_LIMIT)) for name, array in arrays])
+    return _rust.all_below([(as_array(tensor), limits.get(name, GUARD_LIMIT)) for name, tensor in tensors])
 
 
 def bad_rows(tensors: Mapping[str, Tensor], **limits: float) -> tuple[list[str], Tensor]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hqgs import _rust
+from hqgs.model.autograd import as_array
 
 LAMBDA_DSSIM = 0.2  # the weight of D-SSIM beside L1 (Kerbl et al. 2023, equation 7)
 
@@ -66,11 +67,11 @@ class _Photometric(torch.autograd.Function):
     def forward(
         ctx: Any, render: Tensor, target: Tensor, mask: Tensor | None, lambda_dssim: float, knee: float
     ) -> Tensor:
-        counts = None if mask is None else mask.contiguous().numpy().view(np.uint8)
-        x, y = render.detach().contiguous().numpy(), target.contiguous().numpy()
+        counts = None if mask is None else as_array(mask).view(np.uint8)
+        x, y = as_array(render), as_array(target)
         loss, _, _, grad = _rust.photometric(x, y, counts, lambda_dssim, knee, ctx.needs_input_grad[0])
         if grad is not None:
-            ctx.save_for_backward(torch.from_numpy(grad).view(render.shape))
+            ctx.save_for_backward(torch.from_numpy(grad.reshape(x.shape)))
         return render.new_tensor(loss)
 
     @staticmethod
