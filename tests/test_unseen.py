@@ -76,8 +76,8 @@ def check(scene: Scene, truth: Truth) -> None:
     [
         (lambda V: V, None),
         (lambda V: FLIP @ V, "the file has OpenGL's axes; its format wants OpenCV's"),
-        (np.linalg.inv, "poses are taken for camera to world"),
-        (lambda V: np.linalg.inv(FLIP @ V), "camera to world, where the format has world to camera and the"),
+        (np.linalg.inv, "poses are read as camera to world"),
+        (lambda V: np.linalg.inv(FLIP @ V), "camera to world, though the format has world to camera and the"),
     ],
 )
 def test_poses_of_another_kind_are_turned(poses, said: str | None, grey: bool, tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_what_no_photo_shows_is_refused(tmp_path: Path) -> None:
         load_scene(written(behind, tmp_path / "a"))
     aside = replace(truth, points=truth.points + np.array([5000.0, 0, 0]))
     with pytest.raises(
-        ValueError, match=r"outside of all pictures: are they of another scene, frame or unit\?"
+        ValueError, match=r"outside of all photos: do they belong to another scene, frame or unit\?"
     ):
         load_scene(written(aside, tmp_path / "b"))
     away = np.where(np.arange(400) < 300, 5000.0, 0)[:, None]
@@ -155,7 +155,7 @@ def test_a_run_that_ends_below_one_flat_colour_says_so(tmp_path: Path) -> None:
     light = [np.maximum(photo, 150) for photo in truth.photos]
     there = replace(truth, photos=light, points=points, colors=np.zeros((202, 3), np.uint8))
     run = hqgs.train(load_scene(write_colmap(there, tmp_path)), iterations=10, method="3dgs")
-    assert "farther from the photos than one flat colour" in run.report["notes"][0]
+    assert "have a larger error than a picture of one colour" in run.report["notes"][0]
     assert run.report.get("fallen") == run.report["notes"][0]
     sound = hqgs.load("embedded", downscale=12)
     assert "fallen" not in hqgs.train(sound, iterations=40, method="3dgs").report

@@ -227,13 +227,13 @@ def fallen(psnr: float | None, flat: float | None, first: float | None) -> str |
         return None
     if flat is not None and psnr < flat - _FAR_BELOW:
         return (
-            f"renders are farther from the photos than one flat colour is ({psnr:.1f} dB, {flat:.1f} dB): "
-            "the poses, or the points, are not those of these photos"
+            f"renders have a larger error than a picture of one colour ({psnr:.1f} dB, {flat:.1f} dB): "
+            "poses or points do not belong to these photos"
         )
     if first is not None and psnr < first - _FAR_BELOW:
         return (
-            f"the run ends below its first step ({psnr:.1f} dB, {first:.1f} dB): the photos contradict each "
-            "other, by wrong poses, by motion, or by exposures that differ"
+            f"the last step is worse than the first one ({psnr:.1f} dB, {first:.1f} dB): the photos "
+            "contradict each other (wrong poses, moving objects or exposures that differ)"
         )
     return None
 

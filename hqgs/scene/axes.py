@@ -69,7 +69,7 @@ class Way:
             ways, axes = ways[::-1], axes[::-1]
         parts = []
         if self.inverse:
-            parts.append(f"poses are taken for {ways[1]}, where the format has {ways[0]}")
+            parts.append(f"poses are read as {ways[1]}, though the format has {ways[0]}")
         if self.turned:
             held = f"the file has {axes[0]}'s axes; its format wants {axes[1]}'s"
             parts.append("the cameras' y and z axes were flipped" + ("" if self.inverse else f" ({held})"))
@@ -122,8 +122,8 @@ def with_true_axes(capture: Capture, views: Sequence[View]) -> tuple[Capture, st
         found, told = _by_matches(capture, views, ways)
         found = found if told or not few else _by_counts(fits, stated)
     if found is None and not few and stated.by_chance:
-        note = f"colours of points and photos do not agree (correlation {stated.alike:.2f})"
-        return capture, f"{note}: are the points of the same frame as the poses?"
+        note = f"the colours of points and photos do not match (correlation {stated.alike:.2f})"
+        return capture, f"{note}: are points and poses in the same frame?"
     if found is None:
         return capture, None
     way, why = found
@@ -157,8 +157,8 @@ def _by_colors(fits: Sequence[tuple[Way, _Fit]], stated: _Fit) -> tuple[Way, str
     if not clear:
         return None
     way, fit = max(clear, key=lambda one: one[1].alike)
-    how = f"by {fit.alike:.2f} then, by {stated.alike:.2f} as the files have them (correlation)"
-    return way, f"colours of points and photos agree {how}"
+    how = f"of {fit.alike:.2f} then, of {stated.alike:.2f} as the files have them"
+    return way, f"the colours of points and photos have a correlation {how}"
 
 
 def _by_counts(fits: Sequence[tuple[Way, _Fit]], stated: _Fit) -> tuple[Way, str] | None:
@@ -241,16 +241,16 @@ def unseen(views: Sequence[View], points: NDArray[np.floating]) -> list[str]:
         if not (inside.any() or view.face or in_frame(view.camera, points.astype(np.float64)).any()):
             empty.append(view.name)
     if len(points) and views and len(empty) == len(views):
-        where = "outside of all pictures: are they of another scene, frame or unit?"
+        where = "outside of all photos: do they belong to another scene, frame or unit?"
         if not before:
-            where = "behind all cameras: have the poses the axes, and the direction, of their format?"
+            where = "behind all cameras: do the poses have the axes and the direction of their format?"
         raise ValueError(
-            f"no photo shows any of the {len(points)} points, which lie {where} `--sfm` takes cameras and "
-            "points from the photos alone"
+            f"no photo shows any of the {len(points)} points, which lie {where} `--sfm` finds cameras and "
+            "points from the photos instead"
         )
     notes = []
     if (share := 1 - shown.mean() if len(shown) else 0) > _MANY:
-        notes.append(f"{share:.0%} of the points are in no photo: are they of the same frame as the poses?")
+        notes.append(f"{share:.0%} of the points are in no photo: are points and poses in the same frame?")
     if empty:
         which = f"{len(empty)} of {len(views)} photos show none of the points: {some(empty)}"
         notes.append(f"{which}; are their poses right?")
