@@ -178,7 +178,7 @@ def test_a_look_is_kept_where_photos_held_back_gain_by_it() -> None:
     asked = replace(ASKED, hqgs=replace(ASKED.hqgs, formation=formation))
     found = trial.tried_looks(replace(scene, train=train), asked, begin, stages.append)  # type: ignore[arg-type]
     assert [run.tried for run in runs] == [[*FakeLooks.off], [*FakeLooks.blurred]]
-    assert {name: tried.pays for name, tried in found.items()} == {
+    assert {name: tried.helps for name, tried in found.items()} == {
         "exposure": True, "vignetting": False, "response": True, "shake": True,
     }  # fmt: skip
     assert found["exposure"].gain == pytest.approx(20 * np.log10(2), abs=0.6)

@@ -40,6 +40,11 @@ class Tried:
         """Whether the gain is more than photos scatter."""
         return self.gain > SCATTER and self.sure > 1
 
+    @property
+    def helps(self) -> bool:
+        """Whether photos gain more than they differ: what a true look gains in small copies may be little."""
+        return self.sure > 1
+
     def __str__(self) -> str:
         return f"{self.gain:+.2f} ± {self.error:.2f} dB on {self.photos} validation photos of short test runs"
 
