@@ -268,6 +268,18 @@ def test_an_untagged_frame_is_bt601() -> None:
     assert np.abs(as_photo(frame).reshape(-1, 3).mean(0) - RGB).max() <= 2
 
 
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (720, 1280)])
+def test_an_untagged_frame_of_hd_is_bt709(width: int, height: int) -> None:
+    """Y', Cb and Cr by the definition in ITU-R BT.709."""
+    red, green, blue = np.array(RGB) / 255
+    luma = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+    flat = 16 + 219 * luma, 128 + 224 * (blue - luma) / 1.8556, 128 + 224 * (red - luma) / 1.5748
+    sides = [(height, width), *[(height // 2, width // 2)] * 2]
+    levels = [np.full(side, round(value), np.uint8).ravel() for side, value in zip(sides, flat, strict=True)]
+    frame = av.VideoFrame.from_ndarray(np.concatenate(levels).reshape(-1, width), format="yuv420p")
+    assert np.abs(as_photo(frame).reshape(-1, 3).mean(0) - RGB).max() <= 2
+
+
 @pytest.mark.parametrize("matrix", ["bt709", "smpte170m"])
 def test_no_frame_gets_darker(matrix: str) -> None:
     """Colours all over the range: FFmpeg's quick way is 0.9 to 1.4 levels below them."""

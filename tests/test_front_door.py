@@ -55,9 +55,12 @@ def test_of_versions_of_a_photo_one_is_used_and_other_photos_by_such_names_stay(
     first.save(tmp_path / "IMG_0001.webp", quality=60)
     first.point(lambda value: value * 0.8).save(tmp_path / "IMG_E0001.jpg")
     first.resize((200, 150)).save(tmp_path / "IMG_0001_small.png")
+    first.save(tmp_path / "IMG_0001.heic.jpg")  # of a converter that keeps the suffix
     second.save(tmp_path / "IMG_0002.jpg")
     third.save(tmp_path / "IMG_0002 (1).jpg")
-    assert looked_at(tmp_path).names == ["IMG_0001.jpg", "IMG_0002 (1).jpg", "IMG_0002.jpg"]
+    photos = looked_at(tmp_path)
+    assert photos.names == ["IMG_0001.jpg", "IMG_0002 (1).jpg", "IMG_0002.jpg"]
+    assert any("IMG_0001.heic.jpg (of IMG_0001.jpg)" in note for note in photos.notes)
 
 
 def test_photos_deeper_than_those_that_are_used_are_told(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ NAMES = [
     "{stem}.png.mask.png", "{stem}.mask.png", "{stem}-mask.png", "{stem}_mask.png", "mask.{stem}.png",
     "mask_{stem}.png", "mask-{stem}.png", "{stem}_MASK.PNG", "{stem}.png_mask.jpg", "{stem}_masks.webp",
     "mask_{stem}.png.png", "{stem} mask.png",
+    "{stem}.matte.png", "{stem}_alpha.png", "{stem}_sam_mask.png", "{stem}_msk.png",
 ]  # fmt: skip
 IN_FOLDERS = [*NAMES, "{stem}.png", "{stem}.png.png", "{stem}.jpg"]
 
@@ -49,6 +50,16 @@ def test_every_name_in_a_folder_of_masks(tmp_path: Path, pattern: str, write) ->
         assert view.mask is not None
         assert view.mask[:, :24].all()
         assert not view.mask[:, 24:].any()
+
+
+@pytest.mark.parametrize("folder", ["Mask", "images_masks", "image-mask", "sam2_masks", "mattes"])
+def test_folders_of_masks(tmp_path: Path, folder: str) -> None:
+    truth = make_truth(5)
+    write_colmap(truth, tmp_path)
+    put(truth, tmp_path / folder, "{stem}.png")
+    for view in load_scene(tmp_path, test_every=0).train:
+        assert view.mask is not None
+        assert view.mask.mean() == 0.5
 
 
 @pytest.mark.parametrize("pattern", NAMES)

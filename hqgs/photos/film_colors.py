@@ -1,8 +1,9 @@
 """Frames of films as sRGB photos: by the matrix, range, primaries and transfer that the film names.
 
-FFmpeg converts (as BT.601 where a film names no matrix, as it does itself). Films of a high dynamic range are
-brought to BT.709's primaries, with the reference white of 203 cd/m2 (ITU-R BT.2408) at 1, kept up to KNEE and
-bent to reach 1 at infinite light: x -> KNEE + (1 - KNEE) (1 - exp((KNEE - x) / (1 - KNEE))).
+FFmpeg converts. Where a film names no matrix, it is BT.709 in HD and BT.601 below, as players have it. Films
+of a high dynamic range are brought to BT.709's primaries, with the reference white of 203 cd/m2 (ITU-R
+BT.2408) at 1, kept up to KNEE and bent to reach 1 at infinite light:
+x -> KNEE + (1 - KNEE) (1 - exp((KNEE - x) / (1 - KNEE))).
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from hqgs.photos.profiles import HDR, Colors, colors_of_codes, in_srgb, to_709
 
 KNEE = 0.75
 _MATRICES = {1: "bt709", 4: "fcc", 7: "smpte240m", 9: "bt2020", 10: "bt2020"}  # FFmpeg's, by H.273; or bt601
-_FULL = 2  # AVColorRange
+_UNNAMED, _FULL = 2, 2  # AVColorSpace, AVColorRange
+_SD = 1279, 576  # px: the most that films of standard definition have, as mpv has it
 # FFmpeg's quick way makes frames a level darker.
 _EXACT = "flags=bicubic+full_chroma_int+accurate_rnd"
 _BT2020 = 9
@@ -49,6 +51,8 @@ def as_photo(frame: Any, film_transfer: int = 0) -> NDArray[np.uint8]:
 
     colors = film_colors(frame, film_transfer)
     full = frame.color_range == _FULL or frame.format.name.startswith("yuvj")
+    large = frame.width > _SD[0] or frame.height > _SD[1]
+    matrix = 1 if int(frame.colorspace) == _UNNAMED and large and not full else int(frame.colorspace)
     graph = Graph()
     steps = [
         graph.add_buffer(
@@ -56,7 +60,7 @@ def as_photo(frame: Any, film_transfer: int = 0) -> NDArray[np.uint8]:
         ),
         graph.add(
             "scale",
-            f"in_color_matrix={_MATRICES.get(int(frame.colorspace), 'bt601')}:out_range=full:"
+            f"in_color_matrix={_MATRICES.get(matrix, 'bt601')}:out_range=full:"
             f"in_range={'full' if full else 'limited'}:{_EXACT}",
         ),
         graph.add("format", "rgb48le" if colors is not None and colors.hdr != (0, 0) else "rgb24"),

@@ -51,7 +51,7 @@ def film_frames(
     around = _is_around(path)
     state = path.stat()
     rule = f"{count} {FRAMES_A_SECOND} {FRAMES_FEWEST} {FRAMES_MOST}"
-    name = f"9 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
+    name = f"10 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
     target = folder / hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
     if not target.is_dir():
         new = folder / f".{target.name}"

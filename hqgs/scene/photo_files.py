@@ -28,7 +28,9 @@ _NO_PHOTOS = re.compile(
     r"(depths?|confidence|normals?|masks?|segmentations?|semantics?|labels|thumb(nail)?s)([_-]?(maps?|images?))?",
     re.IGNORECASE,
 )
-_MARKED = re.compile(r"^(masks?[._ -])(.+)$|^(.+?)([._ -]masks?)$", re.IGNORECASE)  # of a mask's stem
+_MARK = r"(?:(?:sam\d?[._ -])?masks?|mattes?|alphas?|msks?)"  # by other programs: SAM, mattes of films
+_MARKED = re.compile(rf"^({_MARK}[._ -])(.+)$|^(.+?)([._ -]{_MARK})$", re.IGNORECASE)  # of a mask's stem
+_OF_MASKS = re.compile(r"((images?|photos?|frames?|sam\d?)[_ -])?(masks?|mattes?|alphas?)", re.IGNORECASE)
 Key = tuple[str, ...]
 
 
@@ -57,8 +59,8 @@ def masks_among(names: Iterable[str]) -> set[str]:
 
 
 def is_mask_folder(name: str) -> bool:
-    """Whether a folder is called `masks` or `mask`, however that is spelt."""
-    return name.casefold() in (MASKS, "mask")
+    """Whether a folder is called `masks`, `mask`, `image_masks` or `mattes`, however that is spelt."""
+    return _OF_MASKS.fullmatch(name) is not None
 
 
 def photo_keys(name: str) -> list[Key]:

@@ -10,11 +10,13 @@ import numpy as np
 
 from hqgs.photos.exif import Exif
 from hqgs.photos.files import Glance
+from hqgs.photos.suffixes import PHOTO_SUFFIXES
 
 ALIKE = 0.98  # correlation of the small pictures of two versions, at least
 PLAIN = 4  # of 255, that a small picture must span to be like another
 VERSION = re.compile(
-    r"(?<=IMG_)E(?=\d{4})|[ _-]*(\(\d+\)|copy|kopie|small|resized|thumb|edited|edit|bearbeitet|\d+x\d+)$",
+    r"(?<=IMG_)E(?=\d{4})|[ _-]*(\(\d+\)|copy|kopie|small|resized|thumb|edited|edit|bearbeitet|\d+x\d+)$"
+    rf"|({'|'.join(map(re.escape, PHOTO_SUFFIXES))})$",  # IMG_1.heic.jpg
     re.IGNORECASE,
 )
 NUMBERED = re.compile(r"\(\d+\)$")
