@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 import hqgs
 from benchmarks.scenes.sparse import sparse_cameras
-from hqgs.model.gaussians import Gaussians
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, View
 
@@ -137,15 +136,6 @@ def test_few_points_are_too_few_to_start_from(count: int, tmp_path: Path) -> Non
     assert run.finished
     assert len(run.model) > 1000
     assert any("random points" in note for note in run.report["notes"])
-
-
-def test_a_gaussian_of_each_of_few_points() -> None:
-    points = np.array([[0.0, 0, 0], [0, 3, 0], [4, 0, 0]])
-    for count, scale in ((1, 1.0), (2, 3.0), (3, np.sqrt((9 + 16) / 2))):
-        made = Gaussians.from_points(points[:count], np.zeros((count, 3), np.uint8), 0)
-        assert made.scales.exp()[0, 0].item() == pytest.approx(scale, rel=1e-6)
-    with pytest.raises(ValueError, match="P > 0"):
-        Gaussians.from_points(points[:0], np.zeros((0, 3), np.uint8))
 
 
 def test_a_run_that_ends_below_one_flat_colour_says_so(tmp_path: Path) -> None:

@@ -228,7 +228,7 @@ def fallen(psnr: float | None, flat: float | None, first: float | None) -> str |
     if flat is not None and psnr < flat - _FAR_BELOW:
         return (
             f"renders have a larger error than a picture of one colour ({psnr:.1f} dB, {flat:.1f} dB): "
-            "poses or points do not belong to these photos"
+            "poses or points do not belong to these photos, or the run was far too short"
         )
     if first is not None and psnr < first - _FAR_BELOW:
         return (

@@ -282,16 +282,16 @@ class Gaussians:
     ) -> Gaussians:
         """One Gaussian for each point, as 3DGS starts (Kerbl et al. 2023, section 5.1).
 
-        Round, with the root of the mean squared distance to the 3 nearest neighbours (or as many as there
-        are; alone, 1) as its scale, opacity 0.1, the point's colour from every direction.
+        Round, with the root of the mean squared distance to the 3 nearest neighbours as its scale, opacity
+        0.1, the point's colour from every direction.
 
         Args:
-            points: [P, 3], world units, finite, P >= 1.
+            points: [P, 3], world units, finite, P >= 4.
             colors: [P, 3], uint8.
             sh_degree: degree of the coefficients that are allocated, 0..3.
         """
-        if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-            raise ValueError(f"points has shape {list(points.shape)}, wanted [P, 3] with P > 0")
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) <= NEAREST:
+            raise ValueError(f"points has shape {list(points.shape)}, wanted [P, 3] with P > {NEAREST}")
         if colors.shape != points.shape or colors.dtype != np.uint8:
             raise ValueError(
                 f"colors is {colors.dtype} {list(colors.shape)}, wanted uint8 {list(points.shape)}"
@@ -324,11 +324,9 @@ def near_for(points: NDArray[np.float64]) -> float:
 
 
 def mean_square_distance(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Mean squared distance of each point [P, 3] to its 3 nearest other points, [P]; 1 without another."""
+    """Mean squared distance of each point [P, 3] to its 3 nearest other points, [P]."""
     from scipy.spatial import KDTree  # here: to render or to read a file needs no scipy
 
     xyz = points.astype(np.float64)
-    if len(xyz) == 1:
-        return np.ones(1)
-    distances, _ = KDTree(xyz).query(xyz, k=min(NEAREST + 1, len(xyz)))  # the first is the point itself
+    distances, _ = KDTree(xyz).query(xyz, k=NEAREST + 1)  # the first is the point itself
     return np.square(distances[:, 1:]).mean(axis=1)
