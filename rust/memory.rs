@@ -1,6 +1,27 @@
 //! Memory for large buffers: an error where the system gives none, in place of an abort of the process.
 
 use crate::error::Error;
+use std::sync::{Mutex, PoisonError};
+
+/// Buffers for each thread of rayon's current pool. rayon's own `map_init` makes them for each piece of work, which is
+/// then kept large; and what a thread has begun nobody can take from it when its core is given to another process.
+pub struct OfThreads<B>(Vec<Mutex<B>>);
+
+impl<B: Default> Default for OfThreads<B> {
+    fn default() -> Self {
+        let threads = 0..rayon::current_num_threads();
+        Self(threads.map(|_| Mutex::default()).collect())
+    }
+}
+
+impl<B> OfThreads<B> {
+    /// Lend `f` those of this thread; it must not wait for others of the pool.
+    #[inline(always)]
+    pub fn with<R>(&self, f: impl FnOnce(&mut B) -> R) -> R {
+        let own = rayon::current_thread_index().unwrap_or(0);
+        f(&mut self.0[own].lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
 
 /// Room for `additional` more elements of what `name` says.
 #[inline(always)]

@@ -19,12 +19,6 @@ import hqgs
 from hqgs import _rust
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_arrays_are_borrowed_not_copied(dtype: torch.dtype) -> None:
-    tensor = torch.rand(50, 3, dtype=dtype)
-    assert _rust.data_pointer(tensor.numpy()) == tensor.data_ptr()
-
-
 @pytest.mark.parametrize(
     "array",
     [
@@ -36,8 +30,8 @@ def test_arrays_are_borrowed_not_copied(dtype: torch.dtype) -> None:
     ids=["transposed", "fortran", "strided", "sliced"],
 )
 def test_other_layouts_are_refused(array: np.ndarray) -> None:
-    with pytest.raises(ValueError, match=r"array: must be C-contiguous, got shape \[5, 3\]"):
-        _rust.data_pointer(array)
+    with pytest.raises(ValueError, match=r"arrays: must be C-contiguous, got shape \[5, 3\]"):
+        _rust.all_below([(array, 1.0)])
 
 
 def test_a_transposed_tensor_is_not_misread() -> None:

@@ -420,7 +420,6 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
         ),
         "apply": (operator.apply, {"image": pictures[0], "transposed": False}),
         "apply_absolute": (operator.apply_absolute, {"image": pictures[0].astype(np.float32)}),
-        "data_pointer": (_rust.data_pointer, {"array": np.zeros(3)}),
     }  # fmt: skip
 
 
@@ -470,7 +469,7 @@ def test_a_wrong_shape_is_named_with_the_right_one(call: str, name: str, change:
         ("agreed_depths", "first"),
         ("agreed_depths", "others"),
     }
-    free = call in ("data_pointer", "all_below") or (
+    free = call == "all_below" or (
         leading and (call in ("adam_steps", "cell_distance") or change == "one more")
     )
     free |= change == "one more" and (

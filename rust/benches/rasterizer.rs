@@ -51,6 +51,7 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
             Colors::Harmonics(harmonics),
             &s.camera,
             &options,
+            true,
         )
         .expect("right lengths")
     };

@@ -1,7 +1,7 @@
 //! Vector-Jacobian product of compositing.
 
 use super::{
-    CompositeInput, Composited, for_channels, for_parts, for_vectors,
+    CompositeInput, Composited, TOGETHER, for_channels, for_count,
     gather::{PairLayout, gather},
     kernel::{self, Adjoint, Grid, Layer, Pixels, Sums},
 };
@@ -9,8 +9,8 @@ use crate::{
     constants::{BLOCK, BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
     counts::Counts,
     error::{Error, check_len},
-    memory,
-    simd::{Real, groups::Column},
+    memory::{self, OfThreads},
+    simd::{Real, groups::Column, sums},
     tiles::List,
     uninit::prefetch_all,
 };
@@ -94,7 +94,7 @@ pub fn backward<T: Real>(
             ..CompositeGrads::default()
         });
     }
-    let grid = Grid::new();
+    let (grid, scratch) = (Grid::new(), OfThreads::<Scratch<T>>::default());
     let count = tiles.lists.len();
     let mut pair_grads = memory::filled(Vec::new(), count, NAME)?;
     let mut counts = memory::filled(Counts::default(), count, NAME)?;
@@ -102,14 +102,13 @@ pub fn backward<T: Real>(
         .par_iter_mut()
         .zip(&mut counts)
         .enumerate()
-        .try_for_each_init(
-            Scratch::default,
-            |scratch, (tile, (grads, counts))| -> Result<(), Error> {
-                (*grads, *counts) =
-                    backward_tile(input, composited, v, &grid, tile, layout, scratch)?;
-                Ok(())
-            },
-        )?;
+        .with_max_len(TOGETHER)
+        .try_for_each(|(tile, (grads, counts))| -> Result<(), Error> {
+            (*grads, *counts) = scratch.with(|scratch| {
+                backward_tile(input, composited, v, &grid, tile, layout, scratch)
+            })?;
+            Ok(())
+        })?;
     let gradients = gather(input, &pair_grads, layout, wanted)?;
     pair_grads.into_par_iter().for_each(drop); // to free them takes a while, too
     Ok(CompositeGrads {
@@ -228,7 +227,7 @@ fn read_cotangents<S: Simd, T: Real, const D: usize>(
         }
     }
     for block in 0..TILE_BLOCKS {
-        let any = for_vectors!(S, T, V => kernel::any_nonzero::<S, T, V>(simd, block, &adjoint.v_colors[..channels]));
+        let any = for_count!(kernel::vectors::<S, T>(), V => kernel::any_nonzero::<S, T, V>(simd, block, &adjoint.v_colors[..channels]));
         wanted |= u16::from(any) << block;
     }
     wanted
@@ -270,7 +269,7 @@ fn replay_blocks<S: Simd, T: Real>(
         let mut seen = input.layers(list, block);
         seen.list = &seen.list[..depth];
         let out = &mut layers[begin..end];
-        for_vectors!(S, T, V => kernel::replay::<S, T, V>(simd, grid, block, seen, adjoint, out));
+        for_count!(kernel::vectors::<S, T>(), V => kernel::replay::<S, T, V>(simd, grid, block, seen, adjoint, out));
         begins[block + 1] = end;
     }
     Ok(begins)
@@ -296,7 +295,7 @@ fn unblend_tile<S: Simd, T: Real, const D: usize>(
     simd: S,
     tile: &Replayed<T>,
 ) -> Result<Vec<T>, Error> {
-    for_parts!(S, T, P => unblend::<S, T, D, P>(simd, tile))
+    for_count!(sums::parts::<S, T>(), P => unblend::<S, T, D, P>(simd, tile))
 }
 
 /// Gaussian by Gaussian, back to front, the sums over its blocks.

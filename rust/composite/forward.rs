@@ -1,14 +1,14 @@
 //! Compositing, forward.
 
 use super::{
-    CompositeInput, Composited, for_channels, for_vectors,
+    CompositeInput, Composited, TOGETHER, for_channels, for_count,
     kernel::{self, Grid, Pixels},
 };
 use crate::{
     constants::{BLOCK, BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     counts::Counts,
     error::{Error, check_len},
-    memory,
+    memory::{self, OfThreads},
     project::Projection,
     scene::Camera,
     simd::Real,
@@ -59,7 +59,7 @@ pub fn forward<T: Real>(
     let mut depths = memory::filled([0; TILE_BLOCKS], count, "image")?;
     let mut transmittance = UninitVec::new(count * TILE_PIXELS, "image")?;
     let mut painted = UninitVec::new(count * channels, "image")?;
-    let grid = Grid::new();
+    let (grid, scratch) = (Grid::new(), OfThreads::<Scratch<T>>::default());
     let level = projection.level.token;
     let input = CompositeInput {
         projection,
@@ -73,20 +73,18 @@ pub fn forward<T: Real>(
         .zip(transmittance.cut(repeat_n(TILE_PIXELS, count)))
         .zip(painted.cut(repeat_n(channels, count)))
         .enumerate()
-        .map_init(
-            Scratch::default,
-            |scratch, (tile, (((list, depths), transmittance), colors))| {
-                let started = Instant::now();
-                scattered.list(projection, channels, tile, scratch, list)?;
-                let listing = started.elapsed().as_secs_f64();
-                let transmittance = transmittance.fill(T::ZERO);
-                let colors = colors.fill([T::ZERO; TILE_PIXELS]);
-                let counts = dispatch!(level, simd => for_channels!(
-                    channels, forward_tile, simd, T, (&input, &grid, tile, list, depths, transmittance, colors)
-                ));
-                Ok((counts, listing))
-            },
-        )
+        .with_max_len(TOGETHER)
+        .map(|(tile, (((list, depths), transmittance), colors))| {
+            let started = Instant::now();
+            scratch.with(|scratch| scattered.list(projection, channels, tile, scratch, list))?;
+            let listing = started.elapsed().as_secs_f64();
+            let transmittance = transmittance.fill(T::ZERO);
+            let colors = colors.fill([T::ZERO; TILE_PIXELS]);
+            let counts = dispatch!(level, simd => for_channels!(
+                channels, forward_tile, simd, T, (&input, &grid, tile, list, depths, transmittance, colors)
+            ));
+            Ok((counts, listing))
+        })
         .try_reduce(Default::default, |(a, b), (c, d)| Ok((a.plus(c), b + d)))?;
     let (transmittance, painted) = (transmittance.finish(), painted.finish());
     let (image, alphas) = image_from_tiles(&input, &transmittance, &painted)?;
@@ -124,6 +122,7 @@ fn image_from_tiles<T: Real>(
         .into_par_iter()
         .zip(alphas.cut(pixels))
         .enumerate()
+        .with_max_len(1)
         .for_each(|(row, (image, alphas))| {
             let out = (image.fill(T::ZERO), alphas.fill(T::ZERO));
             dispatch!(level, simd => for_channels!(
@@ -206,7 +205,7 @@ pub(super) fn forward_tile<S: Simd, T: Real, const D: usize>(
     for (block, depth) in depths.iter_mut().enumerate() {
         let pixels = &mut transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
         let layers = input.layers(list, block);
-        let blended = for_vectors!(S, T, V => kernel::blend::<S, T, D, V>(simd, grid, block, layers, pixels, colors));
+        let blended = for_count!(kernel::vectors::<S, T>(), V => kernel::blend::<S, T, D, V>(simd, grid, block, layers, pixels, colors));
         *depth = blended.layers as u32;
         counts.blocks += blended.layers as u64;
         counts.changed_blocks += blended.changed;

@@ -57,7 +57,7 @@ pub(super) fn gather<T: Real>(
     let mut arrays = UninitVec::several(rows.map(|row| row * n), NAME)?;
     let jobs = UninitVec::cut_rows(&mut arrays, rows, chunks.iter().map(|c| c.end - c.begin));
     let level = input.projection.level.token;
-    let jobs = jobs.into_par_iter().zip(chunks);
+    let jobs = jobs.into_par_iter().zip(chunks).with_max_len(1);
     jobs.try_for_each(|(pieces, chunk)| {
         let out = pieces.map(UninitPiece::writer);
         dispatch!(level, simd => for_channels!(

@@ -99,6 +99,10 @@ pub struct Composited<T> {
     transmittance: Vec<T>,
 }
 
+/// Tiles that a thread takes at most at a time: what it has begun waits when its core is given to another process, and
+/// at the end of the image for nobody else to help. 16 of them take 0.1 to 1 ms.
+const TOGETHER: usize = 16;
+
 /// Call a function for the number of channels, of which the common ones are compiled.
 macro_rules! for_channels {
     ($channels:expr, $function:ident, $simd:expr, $T:ty, ($($argument:expr),*)) => {
@@ -110,43 +114,27 @@ macro_rules! for_channels {
     };
 }
 
-/// Call a kernel with the constant V: the number of vectors that a block has on this machine.
+/// Call a kernel with a constant: 1, 2, 4 or 8, as `$count` has it.
 ///
-/// Here and below the types decide in a constant of its own, so that the compiler never sees what no call reaches: each
-/// kernel costs it seconds.
-macro_rules! for_vectors {
-    ($S:ty, $T:ty, $V:ident => $call:expr) => {
-        match const { BLOCK_PIXELS / crate::composite::kernel::width::<$S, $T>() } {
-            1 => for_vectors!(@ $V = 1, $call),
-            2 => for_vectors!(@ $V = 2, $call),
-            4 => for_vectors!(@ $V = 4, $call),
-            8 => for_vectors!(@ $V = 8, $call),
+/// The types decide in a constant of its own, so that the compiler never sees what no call reaches: each kernel costs it
+/// seconds.
+macro_rules! for_count {
+    ($count:expr, $N:ident => $call:expr) => {
+        match const { $count } {
+            1 => for_count!(@ $N = 1, $call),
+            2 => for_count!(@ $N = 2, $call),
+            4 => for_count!(@ $N = 4, $call),
+            8 => for_count!(@ $N = 8, $call),
             _ => unreachable!("vectors have 2 to 16 lanes"),
         }
     };
-    (@ $V:ident = $vectors:literal, $call:expr) => {{
-        const $V: usize = $vectors;
+    (@ $N:ident = $count:literal, $call:expr) => {{
+        const $N: usize = $count;
         $call
     }};
 }
 
-/// Call a function with the constant P: the number of vectors that a sum needs.
-macro_rules! for_parts {
-    ($S:ty, $T:ty, $P:ident => $call:expr) => {
-        match const { crate::simd::sums::parts::<$S, $T>() } {
-            1 => for_parts!(@ $P = 1, $call),
-            2 => for_parts!(@ $P = 2, $call),
-            4 => for_parts!(@ $P = 4, $call),
-            _ => unreachable!("vectors have 16 to 64 bytes"),
-        }
-    };
-    (@ $P:ident = $parts:literal, $call:expr) => {{
-        const $P: usize = $parts;
-        $call
-    }};
-}
-
-use {for_channels, for_parts, for_vectors};
+use {for_channels, for_count};
 
 #[cfg(test)]
 mod tests {
@@ -163,7 +151,8 @@ mod tests {
         let binned = |n, width, height| {
             let s = Synthetic::<f32>::new(n, width, height, 1).unwrap();
             let options = RenderOptions::default();
-            let projected = project::forward(&s.gaussians(), none(), &s.camera, &options).unwrap();
+            let projected =
+                project::forward(&s.gaussians(), none(), &s.camera, &options, false).unwrap();
             let tiles = tiles::bin::<f32>(&projected.projection, &[], 0, &s.camera).unwrap();
             (projected.projection, tiles, s.camera)
         };

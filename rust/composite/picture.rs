@@ -1,14 +1,14 @@
 //! The forward pass of a picture that is shown and forgotten.
 
 use super::{
-    CompositeInput, for_channels,
+    CompositeInput, TOGETHER, for_channels,
     forward::forward_tile,
     kernel::{Grid, Pixels},
 };
 use crate::{
     constants::{TILE, TILE_BLOCKS, TILE_PIXELS},
     error::{Error, check_len},
-    memory,
+    memory::{self, OfThreads},
     project::Projection,
     scene::Camera,
     simd::Real,
@@ -41,7 +41,7 @@ pub fn picture<T: Real>(
         camera,
         background,
     };
-    let grid = Grid::new();
+    let (grid, buffers) = (Grid::new(), OfThreads::<Buffers<T>>::default());
     let level = projection.level.token;
     let count = tiles.tiles_x * tiles.tiles_y;
     let bytes = TILE_PIXELS * channels;
@@ -50,48 +50,41 @@ pub fn picture<T: Real>(
         .cut(std::iter::repeat_n(bytes, count))
         .into_par_iter()
         .enumerate()
-        .try_for_each_init(Buffers::default, |buffers, (tile, out)| {
-            let Buffers {
-                scratch,
-                list,
-                colors,
-                depths,
-            } = buffers;
-            scattered.list(projection, channels, tile, scratch, list)?;
-            let mut transmittance = [T::ZERO; TILE_PIXELS];
-            memory::resize(colors, channels, [T::ZERO; TILE_PIXELS], NAME)?;
-            colors.as_flattened_mut().fill(T::ZERO);
-            dispatch!(level, simd => for_channels!(
-                channels, forward_tile, simd, T, (&input, &grid, tile, list, depths, &mut transmittance, colors)
-            ));
-            let out = out.fill(0);
-            for (p, pixel) in out.chunks_exact_mut(channels.max(1)).enumerate() {
-                for (byte, color) in pixel.iter_mut().zip(&*colors) {
-                    *byte = byte_of(color[p]);
+        .with_max_len(TOGETHER)
+        .try_for_each(|(tile, out)| {
+            buffers.with(|buffers| {
+                let Buffers {
+                    scratch,
+                    list,
+                    colors,
+                    depths,
+                } = buffers;
+                scattered.list(projection, channels, tile, scratch, list)?;
+                let mut transmittance = [T::ZERO; TILE_PIXELS];
+                memory::resize(colors, channels, [T::ZERO; TILE_PIXELS], NAME)?;
+                colors.as_flattened_mut().fill(T::ZERO);
+                dispatch!(level, simd => for_channels!(
+                    channels, forward_tile, simd, T, (&input, &grid, tile, list, depths, &mut transmittance, colors)
+                ));
+                let out = out.fill(0);
+                for (p, pixel) in out.chunks_exact_mut(channels.max(1)).enumerate() {
+                    for (byte, color) in pixel.iter_mut().zip(&*colors) {
+                        *byte = byte_of(color[p]);
+                    }
                 }
-            }
-            Ok(())
+                Ok(())
+            })
         })?;
     rows_from_tiles(&input, &painted.finish())
 }
 
 /// Buffers of one thread, reused from tile to tile.
+#[derive(Default)]
 struct Buffers<T> {
     scratch: Scratch<T>,
     list: List<T>,
     colors: Vec<Pixels<T>>,
     depths: [u32; TILE_BLOCKS],
-}
-
-impl<T: Real> Default for Buffers<T> {
-    fn default() -> Self {
-        Self {
-            scratch: Scratch::default(),
-            list: List::default(),
-            colors: Vec::new(),
-            depths: [0; TILE_BLOCKS],
-        }
-    }
 }
 
 /// The nearest of 255 levels; NaN is 0.

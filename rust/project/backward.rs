@@ -293,6 +293,7 @@ pub fn backward<T: Real>(
     let parts: Vec<_> = jobs
         .into_par_iter()
         .enumerate()
+        .with_max_len(1)
         .map(|(chunk, pieces)| {
             let out = BackwardChunk {
                 outs: pieces.map(UninitPiece::writer),

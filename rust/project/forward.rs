@@ -142,34 +142,14 @@ impl<T: Real> ForwardChunk<'_, T> {
 
 /// Project all Gaussians into `camera`.
 ///
+/// Without `all` only what an image needs: `means2d`, `depths`, `conics` and `opacities` are empty.
+///
 /// Culled: outside the depth range or the image, not finite (its colour included), without rotation, too
 /// transparent, or not larger than `radius_clip`.
 ///
 /// # Errors
 /// When the arrays do not describe the same number of Gaussians, or an option is out of its range.
 pub fn forward<T: Real>(
-    gaussians: &Gaussians<T>,
-    colors: Colors<T>,
-    camera: &Camera,
-    options: &RenderOptions,
-) -> Result<Projected<T>, Error> {
-    project(gaussians, colors, camera, options, true)
-}
-
-/// [`forward`] of what an image needs: `means2d`, `depths`, `conics` and `opacities` are empty.
-///
-/// # Errors
-/// As for [`forward`].
-pub fn forward_for_image<T: Real>(
-    gaussians: &Gaussians<T>,
-    colors: Colors<T>,
-    camera: &Camera,
-    options: &RenderOptions,
-) -> Result<Projected<T>, Error> {
-    project(gaussians, colors, camera, options, false)
-}
-
-fn project<T: Real>(
     gaussians: &Gaussians<T>,
     colors: Colors<T>,
     camera: &Camera,
@@ -211,6 +191,7 @@ fn project<T: Real>(
     let counts = jobs
         .into_par_iter()
         .enumerate()
+        .with_max_len(1)
         .map(
             |(chunk, (((((splats, keys), radii), outs), slopes), clamped))| {
                 let out = ForwardChunk {

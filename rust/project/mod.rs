@@ -10,7 +10,7 @@ mod splats;
 
 pub use backward::{GaussianGrads, ProjectCotangents, Wanted, backward};
 pub use colors::Shading;
-pub use forward::{Projected, forward, forward_for_image};
+pub use forward::{Projected, forward};
 
 use crate::{
     accuracy_knobs::AccuracyKnobs,

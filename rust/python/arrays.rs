@@ -17,79 +17,62 @@ use std::{
     sync::{Mutex, PoisonError},
 };
 
-/// A borrowed C-contiguous array of known type, to read.
+/// A borrowed C-contiguous array of known type.
 ///
 /// Python can still write to the memory while the GIL is released, as any thread can that has a view of it; nothing
 /// here can prevent that. What this file does prevent is that calls of the binding do.
-pub(crate) struct Array<'py, T: Element> {
+pub(crate) struct Borrowed<A> {
     lease: Lease,
     /// A copy: numpy's own lies in memory that another thread may free while the GIL is released, by setting
     /// the array's `shape`.
     shape: Vec<usize>,
-    array: PyReadonlyArrayDyn<'py, T>,
+    array: A,
 }
 
-/// The same to write.
-pub(crate) struct ArrayMut<'py, T: Element> {
-    lease: Lease,
-    shape: Vec<usize>,
-    array: PyReadwriteArrayDyn<'py, T>,
-}
+/// One to read, and one to write.
+pub(crate) type Array<'py, T> = Borrowed<PyReadonlyArrayDyn<'py, T>>;
+pub(crate) type ArrayMut<'py, T> = Borrowed<PyReadwriteArrayDyn<'py, T>>;
 
 impl<'py, T: Element> Array<'py, T> {
     /// Borrow `value`, unless it cannot be read as it is or is being written.
     pub(crate) fn new(name: &'static str, value: &Bound<'py, PyAny>) -> BindingResult<Self> {
-        let array = as_it_is::<T>(name, value)?;
-        let (lease, shape) = (Lease::new(name, array, false)?, array.shape().to_vec());
-        let array = array.try_readonly().map_err(|e| refused(name, e))?;
-        Ok(Self {
-            lease,
-            shape,
-            array,
+        Self::leased(name, value, false, |array| {
+            array.try_readonly().map_err(|e| refused(name, e))
         })
     }
 
     pub(crate) fn slice(&self) -> BindingResult<&[T]> {
         Ok(self.array.as_slice()?)
     }
-
-    pub(crate) fn shape(&self) -> &[usize] {
-        &self.shape
-    }
-
-    /// The array, if it has this shape.
-    pub(crate) fn of_shape(self, expected: &[usize]) -> Result<Self, Error> {
-        check_shape(self.lease.name, &self.shape, expected).map(|()| self)
-    }
-
-    /// The array and N, if it is [N, width].
-    pub(crate) fn of_width(self, width: usize) -> Result<(Self, usize), Error> {
-        match self.shape[..] {
-            [n, w] if w == width => Ok((self, n)),
-            _ => {
-                let (expected, got) = (format!("[N, {width}]"), format!("{:?}", self.shape));
-                Err(Error::shape(self.lease.name, expected, got))
-            }
-        }
-    }
 }
 
 impl<'py, T: Element> ArrayMut<'py, T> {
     /// Borrow `value`, unless it cannot be written as it is or is in use.
     pub(crate) fn new(name: &'static str, value: &Bound<'py, PyAny>) -> BindingResult<Self> {
-        let array = as_it_is::<T>(name, value)?;
-        let (lease, shape) = (Lease::new(name, array, true)?, array.shape().to_vec());
-        let array = array.try_readwrite().map_err(|e| refused(name, e))?;
-        Ok(Self {
-            lease,
-            shape,
-            array,
+        Self::leased(name, value, true, |array| {
+            array.try_readwrite().map_err(|e| refused(name, e))
         })
     }
 
     pub(crate) fn slice(&mut self) -> BindingResult<&mut [T]> {
         Ok(self.array.as_slice_mut()?)
     }
+}
+
+impl<A> Borrowed<A> {
+    fn leased<'py, T: Element>(
+        name: &'static str,
+        value: &Bound<'py, PyAny>,
+        written: bool,
+        borrow: impl FnOnce(&Bound<'py, PyArrayDyn<T>>) -> PyResult<A>,
+    ) -> BindingResult<Self> {
+        let array = as_it_is::<T>(name, value)?;
+        Ok(Self {
+            lease: Lease::new(name, array, written)?,
+            shape: array.shape().to_vec(),
+            array: borrow(array)?,
+        })
+    }
 
     pub(crate) fn shape(&self) -> &[usize] {
         &self.shape
@@ -97,16 +80,23 @@ impl<'py, T: Element> ArrayMut<'py, T> {
 
     /// The array, if it has this shape.
     pub(crate) fn of_shape(self, expected: &[usize]) -> Result<Self, Error> {
-        check_shape(self.lease.name, &self.shape, expected).map(|()| self)
+        if self.shape == expected {
+            return Ok(self);
+        }
+        Err(self.wrong(&format!("{expected:?}")))
     }
-}
 
-fn check_shape(name: &str, shape: &[usize], expected: &[usize]) -> Result<(), Error> {
-    if shape == expected {
-        return Ok(());
+    /// The array and N, if it is [N, width].
+    pub(crate) fn of_width(self, width: usize) -> Result<(Self, usize), Error> {
+        match self.shape[..] {
+            [n, w] if w == width => Ok((self, n)),
+            _ => Err(self.wrong(&format!("[N, {width}]"))),
+        }
     }
-    let (expected, got) = (format!("{expected:?}"), format!("{shape:?}"));
-    Err(Error::shape(name, expected, got))
+
+    fn wrong(&self, expected: &str) -> Error {
+        Error::shape(self.lease.name, expected, format!("{:?}", self.shape))
+    }
 }
 
 fn refused(name: &str, error: impl Display) -> PyErr {

@@ -46,10 +46,7 @@ impl Drop for Composite {
 }
 
 /// One camera's tile lists and replay state.
-struct View<T> {
-    tiles: Tiles<T>,
-    composited: Composited<T>,
-}
+type View<T> = (Tiles<T>, Composited<T>);
 
 #[pymethods]
 impl Composite {
@@ -135,10 +132,7 @@ fn composite_as<'py, T: Scalar>(
                 total = total.plus(view.counts);
                 images.push(view.image);
                 alphas.push(view.alphas);
-                views.push(View {
-                    tiles: view.tiles,
-                    composited: view.composited,
-                });
+                views.push((view.tiles, view.composited));
             }
             Ok((
                 Composite {
@@ -209,7 +203,7 @@ fn composite_backward_as<'py, T: Scalar>(
             let backward = |(i, camera): (usize, _)| {
                 let input = CompositeInput {
                     projection: &frame.projections[i],
-                    tiles: &views[i].tiles,
+                    tiles: &views[i].0,
                     camera,
                     background: backgrounds.map(|b| &b[i * channels..(i + 1) * channels]),
                 };
@@ -217,7 +211,7 @@ fn composite_backward_as<'py, T: Scalar>(
                     image: &v_image[i * pixels * channels..(i + 1) * pixels * channels],
                     alphas: v_alphas.map(|a| &a[i * pixels..(i + 1) * pixels]),
                 };
-                composite::backward(&input, &views[i].composited, &cotangents, wanted)
+                composite::backward(&input, &views[i].1, &cotangents, wanted)
             };
             let cameras = frame.cameras.iter().enumerate();
             cameras.map(backward).collect::<Result<_, Error>>()

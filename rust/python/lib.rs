@@ -11,10 +11,8 @@ mod stereo;
 mod threads;
 mod training;
 
-use arrays::{Array, by_dtype};
 use error::{BindingError, BindingResult};
 use hqgs::internals::{constants, simd};
-use numpy::Element;
 use pyo3::{exceptions::PyOverflowError, prelude::*};
 use std::ffi::{c_int, c_long};
 
@@ -78,16 +76,6 @@ fn simd_level() -> BindingResult<&'static str> {
     Ok(simd::level()?.name())
 }
 
-/// Address of the first element of an array as the crate sees it, to test that nothing is copied.
-#[pyfunction]
-fn data_pointer(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
-    by_dtype!("array", array, pointer_to(array))
-}
-
-fn pointer_to<T: Element>(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
-    Ok(Array::<T>::new("array", array)?.slice()?.as_ptr() as usize)
-}
-
 /// The constants that define an image, for Python to use the same ones.
 fn add_constants(m: &Bound<'_, PyModule>) -> PyResult<()> {
     for (name, value) in [
@@ -115,7 +103,6 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(simd_level, m)?)?;
     m.add_function(wrap_pyfunction!(give_back_memory, m)?)?;
-    m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
     add_constants(m)?;
     project::register(m)?;
     composite::register(m)?;

@@ -4,7 +4,7 @@ use crate::arrays::{Array, filled};
 use crate::error::BindingResult;
 use crate::threads;
 use hqgs::Error;
-use hqgs_training::stereo::{Other, Photo, Sweep};
+use hqgs_training::stereo::{self, Other, Photo};
 use numpy::IntoPyArray;
 use pyo3::prelude::*;
 
@@ -15,7 +15,7 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
 
 type Found<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>);
 
-/// `Sweep::depths`: (depths [M] of float64, correlations [M] of float32). `first` and each of `others` [h, w] of
+/// `stereo::depths`: (depths [M] of float64, correlations [M] of float32). `first` and each of `others` [h, w] of
 /// float32, `maps` [K, 3, 4], `pixels` and `ranges` (nearest and farthest depth) [M, 2] of float64.
 #[pyfunction]
 fn agreed_depths<'py>(
@@ -47,9 +47,9 @@ fn agreed_depths<'py>(
         })
         .collect::<BindingResult<Vec<_>>>()?;
     let (pixels, ranges) = (pixels.slice()?.as_chunks().0, ranges.slice()?.as_chunks().0);
-    let sweep = Sweep { agreeing };
-    let found =
-        py.detach(|| threads::install(|| sweep.depths(first, &others, pixels, ranges)))??;
+    let found = py.detach(|| {
+        threads::install(|| stereo::depths(first, &others, pixels, ranges, agreeing))
+    })??;
     let depths = filled(found.iter().map(|(depth, _)| *depth), "depths")?;
     let scores = filled(found.iter().map(|(_, score)| *score), "depths")?;
     Ok((

@@ -120,7 +120,7 @@ pub fn forward<'a, T: Real>(
         colors: shaded,
         shading,
         ..
-    } = project::forward_for_image(&gaussians, colors, camera, options)?;
+    } = project::forward(&gaussians, colors, camera, options, false)?;
     let (harmonics, given) = match colors {
         Colors::Harmonics(_) => (true, &shaded[..]),
         Colors::Channels(data, _) => (false, data),
@@ -163,7 +163,7 @@ pub fn picture<T: Real>(
         differentiable: false,
         ..*options
     };
-    let projected = project::forward_for_image(&gaussians, colors, camera, &options)?;
+    let projected = project::forward(&gaussians, colors, camera, &options, false)?;
     let (given, channels) = match colors {
         Colors::Harmonics(_) => (&projected.colors[..], 3),
         Colors::Channels(data, channels) => (data, channels),
@@ -180,33 +180,22 @@ pub fn backward<T: Real>(
     v: &Cotangents<T>,
     wanted: Wanted,
 ) -> Result<Gradients<T>, Error> {
-    let Rendered {
-        gaussians,
-        background,
-        camera,
-        options,
-        projection,
-        harmonics,
-        shading,
-        tiles,
-        composited,
-        ..
-    } = rendered;
     let input = CompositeInput {
-        projection,
-        tiles,
-        camera,
-        background: *background,
+        projection: &rendered.projection,
+        tiles: &rendered.tiles,
+        camera: &rendered.camera,
+        background: rendered.background,
     };
+    let harmonics = rendered.harmonics;
     // The colours of harmonics change with the direction in which a Gaussian is seen.
-    let directed = *harmonics && (wanted.means || wanted.viewmat);
+    let directed = harmonics && (wanted.means || wanted.viewmat);
     let composite_wanted = composite::Wanted {
         geometry: wanted.geometry(),
         absolute: wanted.means2d,
         colors: wanted.colors || directed,
-        background: wanted.background && background.is_some(),
+        background: wanted.background && rendered.background.is_some(),
     };
-    let splats = composite::backward(&input, composited, v, composite_wanted)?;
+    let splats = composite::backward(&input, &rendered.composited, v, composite_wanted)?;
     let geometry = composite_wanted.geometry;
     let cotangents = ProjectCotangents {
         means2d: geometry.then_some(&splats.means2d[..]),
@@ -214,7 +203,7 @@ pub fn backward<T: Real>(
         opacities: geometry.then_some(&splats.opacities[..]),
         depths: None,
         conics: None,
-        colors: (*harmonics && composite_wanted.colors).then_some(&splats.colors[..]),
+        colors: (harmonics && composite_wanted.colors).then_some(&splats.colors[..]),
     };
     let project_wanted = project::Wanted {
         means: wanted.means,
@@ -222,22 +211,24 @@ pub fn backward<T: Real>(
         scales: wanted.scales,
         opacities: wanted.opacities,
         covars: false,
-        harmonics: *harmonics && wanted.colors,
-        harmonics_rest: *harmonics && wanted.colors,
+        harmonics: harmonics && wanted.colors,
+        harmonics_rest: harmonics && wanted.colors,
         camera: wanted.viewmat,
     };
     let grads = project::backward(
-        gaussians,
-        shading.as_ref(),
-        camera,
-        options,
-        projection,
+        &rendered.gaussians,
+        rendered.shading.as_ref(),
+        &rendered.camera,
+        &rendered.options,
+        &rendered.projection,
         &cotangents,
         project_wanted,
     )?;
     let channels_wanted = wanted.colors && !harmonics;
     Ok(Gradients {
-        viewmat: wanted.viewmat.then(|| grads.camera.viewmat(camera)),
+        viewmat: wanted
+            .viewmat
+            .then(|| grads.camera.viewmat(&rendered.camera)),
         means: grads.means,
         quats: grads.quats,
         scales: grads.scales,

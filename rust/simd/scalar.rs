@@ -8,7 +8,7 @@ pub type Lanes<T, S> = <T as SimdFloatElement>::Native<S>;
 
 mod sealed {
     /// What no other type is, and what the kernels ask of it.
-    pub trait Scalar: fearless_simd::SimdFloatElement + crate::uninit::Plain {}
+    pub trait Scalar: fearless_simd::SimdFloatElement + crate::uninit::Plain + Default {}
     impl Scalar for f32 {}
     impl Scalar for f64 {}
 }

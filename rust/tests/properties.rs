@@ -122,8 +122,8 @@ impl Scene {
         });
         let background = flat::<T, _>(&[self.background]);
         let given_colors = harmonics.map_or(Colors::Channels(&given, 3), Colors::Harmonics);
-        let projected =
-            project::forward(&gaussians, given_colors, &camera, &self.options).expect("lengths");
+        let projected = project::forward(&gaussians, given_colors, &camera, &self.options, true)
+            .expect("lengths");
         let (projection, radii) = (projected.projection, projected.radii);
         let colors = if harmonics.is_some() {
             &projected.colors

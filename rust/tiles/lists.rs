@@ -48,6 +48,7 @@ impl<T: Copy> List<T> {
 }
 
 /// Buffers of one thread, reused from tile to tile.
+#[derive(Default)]
 pub(crate) struct Scratch<T> {
     /// (bits of the depth as f32, place by index).
     keys: Vec<u64>,
@@ -58,19 +59,6 @@ pub(crate) struct Scratch<T> {
     colors: Vec<T>,
     shapes: Shapes,
     reached: [Vec<u32>; TILE_BLOCKS],
-}
-
-impl<T> Default for Scratch<T> {
-    fn default() -> Self {
-        Self {
-            keys: Vec::new(),
-            sorted: Vec::new(),
-            records: Vec::new(),
-            colors: Vec::new(),
-            shapes: Shapes::default(),
-            reached: Default::default(),
-        }
-    }
 }
 
 /// Collect a tile's pairs and order them, in the place of what `list` held.

@@ -17,7 +17,7 @@ pub(crate) use spans::Reach;
 use crate::{
     constants::{MAX_PAIR_BYTES, MAX_PAIRS, TILE},
     error::Error,
-    memory,
+    memory::{self, OfThreads},
     project::Projection,
     scene::Camera,
     simd::Real,
@@ -80,11 +80,12 @@ pub fn bin<T: Real>(
     let count = tiles.tiles_x * tiles.tiles_y;
     let mut lists = memory::with_capacity(count, NAME)?;
     lists.resize_with(count, List::default);
+    let scratch = OfThreads::<Scratch<T>>::default();
     lists
         .par_iter_mut()
         .enumerate()
-        .try_for_each_init(Scratch::default, |scratch, (tile, list)| {
-            pairs.list(projection, channels, tile, scratch, list)
+        .try_for_each(|(tile, list)| {
+            scratch.with(|scratch| pairs.list(projection, channels, tile, scratch, list))
         })?;
     tiles.lists = lists;
     Ok(tiles)
@@ -149,6 +150,7 @@ fn scatter<T: Real>(
     let level = projection.level.token;
     let made: Vec<_> = (0..n.div_ceil(size))
         .into_par_iter()
+        .with_max_len(1)
         .map(|k| {
             let range = k * size..n.min((k + 1) * size);
             dispatch!(level, simd => source.chunk(simd, range))
@@ -194,7 +196,7 @@ mod tests {
         let s = Synthetic::<f32>::new(9000, 300, 200, 1).unwrap();
         let none = Colors::<f32>::Channels(&[], 0);
         let options = RenderOptions::default();
-        let projected = project::forward(&s.gaussians(), none, &s.camera, &options).unwrap();
+        let projected = project::forward(&s.gaussians(), none, &s.camera, &options, false).unwrap();
         let projection = projected.projection;
         let pairs = bin::<f32>(&projection, &[], 0, &s.camera).unwrap().pairs() as u64;
         assert!(pairs > 20_000); // of several chunks
@@ -223,7 +225,7 @@ mod tests {
         let s = Synthetic::<f32>::new(1000, 3000, 2000, 1).unwrap();
         let none = Colors::<f32>::Channels(&[], 0);
         let options = RenderOptions::default();
-        let projected = project::forward(&s.gaussians(), none, &s.camera, &options).unwrap();
+        let projected = project::forward(&s.gaussians(), none, &s.camera, &options, false).unwrap();
         let source = |limit| Source::<f32> {
             projection: &projected.projection,
             colors: &[],

@@ -26,6 +26,11 @@ pub(super) const fn width<S: Simd, T: Real>() -> usize {
     <Lanes<T, S> as SimdBase<S>>::LEN
 }
 
+/// Vectors of a block.
+pub(super) const fn vectors<S: Simd, T: Real>() -> usize {
+    BLOCK_PIXELS / width::<S, T>()
+}
+
 /// (row, column) in the tile of pixel `p` in block order.
 pub(super) const fn position(p: usize) -> (usize, usize) {
     let (block, inner) = (p / BLOCK_PIXELS, p % BLOCK_PIXELS);

@@ -272,7 +272,8 @@ fn project_as<'py, T: Scalar>(
     let colors = shades.of(n, cameras.len(), inputs.sh_degree)?;
     let mut outs: Vec<_> = py.detach(|| {
         threads::install(|| {
-            let project = |(i, camera)| project::forward(&gaussians, colors(i), camera, &options);
+            let project =
+                |(i, camera)| project::forward(&gaussians, colors(i), camera, &options, true);
             cameras
                 .iter()
                 .enumerate()

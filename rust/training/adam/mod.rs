@@ -133,6 +133,7 @@ pub fn steps<T: Real>(steps: Vec<AdamStep<'_, T>>) -> Result<(), Error> {
     let level = simd::level()?.token();
     tasks
         .into_par_iter()
+        .with_max_len(1)
         .for_each(|(arrays, factors, width, used)| {
             dispatch!(level, simd => update_rows(simd, &factors, arrays, width, used));
         });

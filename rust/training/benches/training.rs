@@ -10,7 +10,7 @@ use hqgs_training::{
     jpeg_cells,
     loss::{self, Images, LossOptions, LossScratch},
     separable::{Dense, Separable},
-    stereo::{Other, Photo, Sweep},
+    stereo::{self, Other, Photo},
     views::{self, ViewColors, ViewRows},
 };
 use std::time::Duration;
@@ -149,12 +149,7 @@ fn depths(c: &mut Criterion) {
         .collect();
     let ranges = vec![[0.5, 4.0]; pixels.len()];
     c.bench_function("depths", |b| {
-        let sweep = Sweep { agreeing: 2 };
-        b.iter(|| {
-            sweep
-                .depths(picture, &others, &pixels, &ranges)
-                .expect("right lengths")
-        });
+        b.iter(|| stereo::depths(picture, &others, &pixels, &ranges, 2).expect("right lengths"));
     });
 }
 

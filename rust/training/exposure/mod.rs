@@ -160,7 +160,7 @@ impl<T: Light> Photograph<T> {
             .into_par_iter()
             .zip(pieces(&mut photo, sizes.pixels() * 3, across * 3))
             .enumerate()
-            .try_for_each_init(Sources::default, |sources, (row, (mean, photo))| {
+            .try_for_each_init(Vec::new, |sources, (row, (mean, photo))| {
                 let (mean, photo) = (mean.fill([T::ZERO; WIDE]), photo.fill(T::ZERO));
                 dispatch!(token, simd => taken.take_row(simd, row, sources, tables, mean, photo))
             })?;
@@ -253,7 +253,7 @@ impl<T: Light> Photograph<T> {
         &self,
         _: S, // the instructions that this is compiled for
         row: usize,
-        sources: &mut Sources<T>,
+        sources: &mut Vec<Source<T>>,
         tables: &Tables,
         mean: &mut [[T; WIDE]],
         photo: &mut [T],
@@ -266,7 +266,7 @@ impl<T: Light> Photograph<T> {
         let share = T::from_f64(1.0 / self.warps.len().max(1) as f64);
         for warp in &self.warps {
             self.find(row, warp, sources)?;
-            for (source, mean) in sources.of_row.iter().zip(mean.iter_mut()) {
+            for (source, mean) in sources.iter().zip(mean.iter_mut()) {
                 let [a, b, c, d] = self.corners(source);
                 let (x, y) = (source.fx, source.fy);
                 for i in 0..WIDE {
@@ -294,7 +294,7 @@ impl<T: Light> Photograph<T> {
         let mut v_warps = memory::filled([0.0; 12], self.warps.len(), "gradient")?;
         let mut v_gains = [0.0; 3];
         let mut v_mean = memory::filled([T::ZERO; WIDE], across, "gradient")?;
-        let mut sources = Sources::default();
+        let mut sources = Vec::new();
         let gains = self.gains.map(T::from_f64);
         let share = T::from_f64(1.0 / self.warps.len().max(1) as f64);
         for (row, v_photo) in (first..).zip(v_photo.chunks_exact(across * 3)) {
@@ -325,7 +325,7 @@ impl<T: Light> Photograph<T> {
                 self.find(row, warp, &mut sources)?;
                 let mut sums = [T::ZERO; 12];
                 let y = T::from_f64(row as f64 + 0.5);
-                for (x, (source, v)) in sources.of_row.iter().zip(&v_mean).enumerate() {
+                for (x, (source, v)) in sources.iter().zip(&v_mean).enumerate() {
                     let [a, b, c, d] = self.corners(source);
                     let (fx, fy) = (source.fx, source.fy);
                     let (mut v_x, mut v_y) = (T::ZERO, T::ZERO);
@@ -396,10 +396,10 @@ impl<T: Light> Photograph<T> {
 
     /// Where a warp takes the pixels of a row.
     #[inline(always)]
-    fn find(&self, row: usize, warp: &Warp, sources: &mut Sources<T>) -> Result<(), Error> {
+    fn find(&self, row: usize, warp: &Warp, sources: &mut Vec<Source<T>>) -> Result<(), Error> {
         let [height, width] = self.sizes.render_size();
         let across = self.sizes.size[1];
-        memory::resize(&mut sources.of_row, across, Source::default(), "photo")?;
+        memory::resize(sources, across, Source::default(), "photo")?;
         let m = warp.map(T::from_f64);
         let y = T::from_f64(row as f64 + 0.5);
         let shift = T::from_f64(self.sizes.margin as f64 - 0.5);
@@ -407,7 +407,7 @@ impl<T: Light> Photograph<T> {
             T::from_f64((width - 1) as f64),
             T::from_f64((height - 1) as f64),
         );
-        for (x, source) in sources.of_row.iter_mut().enumerate() {
+        for (x, source) in sources.iter_mut().enumerate() {
             let nearness = self.nearness_at(row * across + x);
             let x = T::from_f64(x as f64 + 0.5);
             let e = |r: usize| m[r] * x + m[r + 1] * y + m[r + 2] + m[r + 3] * nearness;
@@ -506,12 +506,6 @@ struct Source<T> {
     /// In the photo's coordinates.
     x: T,
     y: T,
-}
-
-/// Buffer of one thread.
-#[derive(Default)]
-struct Sources<T> {
-    of_row: Vec<Source<T>>,
 }
 
 /// Gradients from one band of the photo.

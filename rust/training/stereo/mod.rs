@@ -72,107 +72,97 @@ pub struct Other<'a> {
     pub map: [f64; 12],
 }
 
-/// How to search.
-#[derive(Debug, Clone, Copy)]
-pub struct Sweep {
-    /// Photos that must agree.
-    pub agreeing: usize,
+/// For each of `pixels` (x, y) of `first`: the depth in its range at which the others agree best, and the mean
+/// correlation of those `agreeing` that agree best, in which each one that is missing counts as -1; -1 where the
+/// patch is flat or no photo shows it.
+///
+/// # Errors
+/// Names an array of another size, a range that is not 0 < nearest <= farthest, a value out of range, or what
+/// there is no memory for.
+pub fn depths(
+    first: Photo<'_>,
+    others: &[Other<'_>],
+    pixels: &[[f64; 2]],
+    ranges: &[[f64; 2]],
+    agreeing: usize,
+) -> Result<Vec<(f64, f32)>, Error> {
+    if agreeing == 0 {
+        return Err(Error::new("agreeing", "must be at least 1"));
+    }
+    check_len("ranges", ranges, pixels.len())?;
+    first.check("first")?;
+    for other in others {
+        other.picture.check("others")?;
+        if !other.map.iter().all(|x| x.is_finite()) {
+            return Err(Error::new("maps", "must be finite"));
+        }
+    }
+    if let Some([near, far]) = ranges
+        .iter()
+        .find(|[near, far]| !(*near > 0.0 && near <= far && far.is_finite()))
+    {
+        let message = format!("must be finite and 0 < nearest <= farthest, got {near} to {far}");
+        return Err(Error::new("ranges", message));
+    }
+    if let Some(bad) = pixels
+        .iter()
+        .find(|pixel| !pixel.iter().all(|x| x.is_finite()))
+    {
+        return Err(Error::new("pixels", format!("must be finite, got {bad:?}")));
+    }
+    let mut found = memory::filled((0.0, NOTHING), pixels.len(), "depths")?;
+    let token = simd::level()?.token();
+    found
+        .par_chunks_mut(CHUNK)
+        .zip(pixels.par_chunks(CHUNK).zip(ranges.par_chunks(CHUNK)))
+        .try_for_each(|(found, (pixels, ranges))| {
+            dispatch!(token, simd => chunk(simd, first, others, pixels, ranges, agreeing, found))
+        })?;
+    Ok(found)
 }
 
-impl Sweep {
-    /// For each of `pixels` (x, y) of `first`: the depth in its range at which the others agree best, and the mean
-    /// correlation of those `agreeing` that agree best, in which each one that is missing counts as -1; -1 where the
-    /// patch is flat or no photo shows it.
-    ///
-    /// # Errors
-    /// Names an array of another size, a range that is not 0 < nearest <= farthest, a value out of range, or what
-    /// there is no memory for.
-    pub fn depths(
-        &self,
-        first: Photo<'_>,
-        others: &[Other<'_>],
-        pixels: &[[f64; 2]],
-        ranges: &[[f64; 2]],
-    ) -> Result<Vec<(f64, f32)>, Error> {
-        if self.agreeing == 0 {
-            return Err(Error::new("agreeing", "must be at least 1"));
-        }
-        check_len("ranges", ranges, pixels.len())?;
-        first.check("first")?;
-        for other in others {
-            other.picture.check("others")?;
-            if !other.map.iter().all(|x| x.is_finite()) {
-                return Err(Error::new("maps", "must be finite"));
+#[inline(always)]
+fn chunk<S: Simd>(
+    _: S, // the instructions that this is compiled for
+    first: Photo<'_>,
+    others: &[Other<'_>],
+    pixels: &[[f64; 2]],
+    ranges: &[[f64; 2]],
+    agreeing: usize,
+    found: &mut [(f64, f32)],
+) -> Result<(), Error> {
+    let mut best = memory::filled(NOTHING, agreeing, "agreeing")?;
+    for ((pixel, &[near, far]), found) in pixels.iter().zip(ranges).zip(found) {
+        *found = ((near * far).sqrt(), NOTHING);
+        let Some(patch) = Patch::of(first, *pixel) else {
+            continue;
+        };
+        let mut score = |depth: f64| patch.agreement(others, *pixel, depth, &mut best);
+        let steps = steps(others, *pixel, [near, far]);
+        let mut spacing = (far / near).ln() / (steps - 1) as f64;
+        let mut most = NOTHING;
+        for k in 0..steps {
+            let depth = near * (k as f64 * spacing).exp();
+            let now = score(depth);
+            if now > most {
+                (most, *found) = (now, (depth, now));
             }
         }
-        if let Some([near, far]) = ranges
-            .iter()
-            .find(|[near, far]| !(*near > 0.0 && near <= far && far.is_finite()))
-        {
-            let message =
-                format!("must be finite and 0 < nearest <= farthest, got {near} to {far}");
-            return Err(Error::new("ranges", message));
+        if most <= NOTHING {
+            continue;
         }
-        if let Some(bad) = pixels
-            .iter()
-            .find(|pixel| !pixel.iter().all(|x| x.is_finite()))
-        {
-            return Err(Error::new("pixels", format!("must be finite, got {bad:?}")));
-        }
-        let mut found = memory::filled((0.0, NOTHING), pixels.len(), "depths")?;
-        let token = simd::level()?.token();
-        found
-            .par_chunks_mut(CHUNK)
-            .zip(pixels.par_chunks(CHUNK).zip(ranges.par_chunks(CHUNK)))
-            .try_for_each(|(found, (pixels, ranges))| {
-                dispatch!(token, simd => self.chunk(simd, first, others, pixels, ranges, found))
-            })?;
-        Ok(found)
-    }
-
-    #[inline(always)]
-    fn chunk<S: Simd>(
-        &self,
-        _: S, // the instructions that this is compiled for
-        first: Photo<'_>,
-        others: &[Other<'_>],
-        pixels: &[[f64; 2]],
-        ranges: &[[f64; 2]],
-        found: &mut [(f64, f32)],
-    ) -> Result<(), Error> {
-        let mut best = memory::filled(NOTHING, self.agreeing, "agreeing")?;
-        for ((pixel, &[near, far]), found) in pixels.iter().zip(ranges).zip(found) {
-            *found = ((near * far).sqrt(), NOTHING);
-            let Some(patch) = Patch::of(first, *pixel) else {
-                continue;
-            };
-            let mut score = |depth: f64| patch.agreement(others, *pixel, depth, &mut best);
-            let steps = steps(others, *pixel, [near, far]);
-            let mut spacing = (far / near).ln() / (steps - 1) as f64;
-            let mut most = NOTHING;
-            for k in 0..steps {
-                let depth = near * (k as f64 * spacing).exp();
+        for _ in 0..HALVINGS {
+            spacing *= 0.5;
+            let middle = found.0;
+            for depth in [middle * (-spacing).exp(), middle * spacing.exp()] {
                 let now = score(depth);
                 if now > most {
                     (most, *found) = (now, (depth, now));
                 }
             }
-            if most <= NOTHING {
-                continue;
-            }
-            for _ in 0..HALVINGS {
-                spacing *= 0.5;
-                let middle = found.0;
-                for depth in [middle * (-spacing).exp(), middle * spacing.exp()] {
-                    let now = score(depth);
-                    if now > most {
-                        (most, *found) = (now, (depth, now));
-                    }
-                }
-            }
         }
-        Ok(())
     }
+    Ok(())
 }
 
 /// Depths that are tried: as many as move the patch by SPACING at most.

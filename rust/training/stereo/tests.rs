@@ -50,15 +50,14 @@ fn swept(shifts: &[f64], range: [f64; 2], agreeing: usize) -> Vec<(f64, f32)> {
         })
         .collect();
     let pixels = pixels();
-    let sweep = Sweep { agreeing };
-    sweep
-        .depths(
-            picture(&first),
-            &others,
-            &pixels,
-            &vec![range; pixels.len()],
-        )
-        .unwrap()
+    depths(
+        picture(&first),
+        &others,
+        &pixels,
+        &vec![range; pixels.len()],
+        agreeing,
+    )
+    .unwrap()
 }
 
 #[test]
@@ -98,8 +97,7 @@ fn borders_flat_patches_and_bad_input() {
         picture,
         map: map(0.1),
     };
-    let sweep = Sweep { agreeing: 1 };
-    let run = |first, pixel, near| sweep.depths(first, &[other], &[pixel], &[[near, 1.5]]);
+    let run = |first, pixel, near| depths(first, &[other], &[pixel], &[[near, 1.5]], 1);
     assert!(run(picture, [1.0, 30.0], 1.0).unwrap()[0].1 <= -1.0);
     assert!(run(picture, [-1e30, 1e30], 1.0).unwrap()[0].1 <= -1.0);
     let flat = Photo {
@@ -113,23 +111,13 @@ fn borders_flat_patches_and_bad_input() {
         picture,
         map: [-1., 0., 0., 0., 0., -1., 0., 0., 0., 0., -1., 0.],
     };
-    assert!(
-        sweep
-            .depths(picture, &[behind], &[[40.5, 30.5]], &[[0.5, 1.5]])
-            .unwrap()[0]
-            .1
-            <= -1.0
-    );
+    assert!(depths(picture, &[behind], &[[40.5, 30.5]], &[[0.5, 1.5]], 1).unwrap()[0].1 <= -1.0);
     let short = Photo {
         size: SIZE,
         grey: &grey[1..],
     };
     assert!(run(short, [40.5, 30.5], 1.0).is_err());
-    assert!(
-        Sweep { agreeing: 0 }
-            .depths(picture, &[other], &[], &[])
-            .is_err()
-    );
+    assert!(depths(picture, &[other], &[], &[], 0).is_err());
 }
 
 #[test]
@@ -149,19 +137,15 @@ fn each_level_and_number_of_threads_gives_the_same_bits() {
             map: map(-0.1),
         },
     ];
-    let (pixels, sweep) = (pixels(), Sweep { agreeing: 2 });
+    let pixels = pixels();
     let ranges = vec![[0.7, 1.5]; pixels.len()];
     let run = |level, threads| {
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
             .build()
             .unwrap();
-        pool.install(|| {
-            at_level(level, || {
-                sweep.depths(picture(0), &others, &pixels, &ranges)
-            })
-        })
-        .unwrap()
+        pool.install(|| at_level(level, || depths(picture(0), &others, &pixels, &ranges, 2)))
+            .unwrap()
     };
     let all: Vec<_> = simd::levels().iter().map(|&level| run(level, 1)).collect();
     for found in &all {
@@ -197,6 +181,6 @@ fn a_patch_at_the_corner_of_a_wide_picture_stays_inside() {
 fn more_pixels_than_can_be_numbered_are_refused() {
     let size = [1 << 32, 1 << 32];
     let picture = Photo { size, grey: &[] };
-    let found = Sweep { agreeing: 1 }.depths(picture, &[], &[], &[]);
+    let found = depths(picture, &[], &[], &[], 1);
     assert_eq!(found.unwrap_err().name(), "first");
 }
