@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -51,6 +52,22 @@ def capture_of(views: Sequence[View], points: NDArray[np.float64], colors: NDArr
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0.5, 0.5])
     photos = [Photo(view.name, Path(view.name), camera, view.camera.viewmat) for view in views]
     return Capture("transforms", photos, 1.0, points, colors)
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_inverse_poses_of_photos_side_by_side(inverse: bool) -> None:
+    """Their epipolar lines are those of the right poses; what the photos show is behind the cameras."""
+    first, moves = sparse_cameras(200, 150, 25)[10], np.stack([np.eye(4)] * 4)
+    moves[:, 0, 3] = [0.0, -0.15, -0.3, -0.45]
+    stored = []
+    for k, move in enumerate(moves):
+        said = replace(first, viewmat=np.linalg.inv(move) if inverse else move)
+        stored.append(View(f"{k}.png", said, render_view(replace(first, viewmat=move @ first.viewmat))))
+    capture, told = with_true_axes(replace(capture_of(stored, *no_points()), source="colmap"), stored)
+    for photo, move in zip(capture.photos, moves, strict=True):
+        np.testing.assert_allclose(photo.viewmat, move, atol=1e-9)
+    assert (told is not None) == inverse
+    assert told is None or "poses are read as camera to world" in told
 
 
 def test_photos_that_do_not_match_tell_nothing() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fixtures_scenes import make_truth, photographed, write_colmap
+from fixtures_scenes import make_truth, photographed, write_colmap, write_transforms
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from test_formats import change_gltf
@@ -214,6 +214,40 @@ def test_views_and_paths_of_a_run_go_along_with_its_moved_scene(tmp_path: Path) 
     assert max(np.abs(a - b).max() for a, b in zip(before, after, strict=True)) <= 1
     change_gltf(run / "scene.glb", lambda c: c["nodes"][1].update(scale=[2.0, 1, 1]))
     assert main(["render", str(run / "scene.glb"), "--views", "all", "--out", str(tmp_path / "no")]) == 2
+
+
+@pytest.mark.parametrize("kind", ["lost comment", "another's", "lost frame beside it"])
+def test_views_and_paths_find_a_scene_whose_frame_nothing_says(tmp_path: Path, kind: str) -> None:
+    """Cameras of a run whose world was moved, beside a scene in the photos' frame: as photographed."""
+    truth = make_truth(6)
+    truth = replace(truth, params=[42.0, 42, 24, 18], K=np.array([[42.0, 0, 24], [0, 42, 18], [0, 0, 1]]))
+    truth, gaussians = photographed(truth)
+    far = truth.viewmats.copy()
+    far[:, :3, 3] = 1024 * far[:, :3, 3] - far[:, :3, :3] @ (30000.0, -2000, 500)
+    write_transforms(replace(truth, viewmats=far), tmp_path / "scene", fl_x=42, cx=24, cy=18)
+    scene = load_scene(tmp_path / "scene", points=False)
+    assert not scene.world.ordinary
+    save_cameras(tmp_path / "run", scene)
+    gaussians.world = World(1024.0, (30000.0, -2000.0, 500.0))
+    name = {"lost comment": "scene.ply", "another's": "a.splat"}.get(kind, "a.spz")
+    if name == "a.spz":
+        gaussians.in_world(scene.world).save(tmp_path / "run" / name)
+        (tmp_path / "run/a.spz.world.json").unlink()
+    else:
+        means = gaussians.world.out(gaussians.means.double().numpy())
+        bare = replace(gaussians, means=torch.from_numpy(means).float(), world=World())
+        bare.scales = bare.scales + np.log(1024)
+        bare.save(tmp_path / "run" / name)
+    K, size = truth.K, (truth.width, truth.height)
+    save_path(tmp_path / "path.json", [Camera(*size, K, viewmat) for viewmat in far])
+    shown = []
+    for way, given in (("views", "view_01,images/view_04.png"), ("path", tmp_path / "path.json")):
+        out = tmp_path / way
+        assert main(["render", str(tmp_path / "run" / name), f"--{way}", str(given), "--out", str(out)]) == 0
+        shown += pictures(out)
+    wanted = [truth.photos[k].astype(int) for k in (1, 4, *range(6))]
+    worst = max(np.abs(a - b).max() for a, b in zip(shown, wanted, strict=True))
+    assert worst <= (12 if name == "a.spz" else 1)  # of 8 bits
 
 
 def test_a_camera_path_of_nerfstudio_goes_along_with_its_export(

@@ -20,6 +20,7 @@ from benchmarks.scenes.panorama import panorama_room
 from hqgs.base.stages import Stage
 from hqgs.diagnosis.differences import TURNED, unlike_sharpness
 from hqgs.evaluation.metrics import psnr
+from hqgs.photos.exif import read_exif
 from hqgs.scene import views
 from hqgs.scene.faces import CUBE, around, face_name, faces_of
 from hqgs.scene.geometry import project
@@ -151,9 +152,12 @@ def test_a_panorama_is_read_as_the_faces_of_a_cube(tmp_path: Path, monkeypatch: 
     assert np.median(off(half.train[0])) < 8
 
 
-@pytest.mark.parametrize("floor", [0.0, 0.3])
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_a_turntable_before_a_graded_backdrop_is_flat(floor: float, suffix: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("floor", "suffix", "unlike"), [(0.0, ".png", 0), (0.3, ".png", 0), (0.3, ".jpg", 0), (0, ".jpg", 0.1)]
+)
+def test_a_turntable_before_a_graded_backdrop_is_flat(
+    floor: float, suffix: str, unlike: float, tmp_path: Path
+) -> None:
     """Its photos are 2:1, end as they begin, and are plain above and below: as a panorama is."""
     rng = np.random.default_rng(0)
     rows, columns = np.mgrid[:128, :256] / 128
@@ -161,10 +165,9 @@ def test_a_turntable_before_a_graded_backdrop_is_flat(floor: float, suffix: str,
     for k in range(12):
         thing = gaussian_filter(rng.normal(size=(128, 256)), 2.0)
         inside = (columns - 1) ** 2 + (rows - 0.5) ** 2 < 0.1
-        grey = np.where(inside, 120 + 400 * thing, backdrop) + rng.normal(0, 1, backdrop.shape)
-        Image.fromarray(np.rint(grey.clip(0, 255)).astype(np.uint8)).convert("RGB").save(
-            tmp_path / f"{k}{suffix}"
-        )
+        grey = np.where(inside, 120 + 400 * thing, backdrop) + rng.normal(0, 1 + 50 * unlike, backdrop.shape)
+        lit = np.rint((grey * (1 + unlike * np.sin(k))).clip(0, 255)).astype(np.uint8)
+        Image.fromarray(lit).convert("RGB").save(tmp_path / f"{k}{suffix}")
     photos = looked_at(tmp_path)
     assert not photos.around
     assert len(photos.names) == 12
@@ -289,6 +292,42 @@ def test_what_is_no_walk_of_panoramas_is_refused_by_name(tmp_path: Path) -> None
     save(tmp_path / "parts", "a.jpg b.jpg", (90, 30), xmp=TAG)
     with pytest.raises(ValueError, match=r"2 of 2 photos are tagged .* \(a\.jpg: 90 x 30 px\)"):
         looked_at(tmp_path / "parts")
+
+
+def gpano(apart: str, **said: object) -> bytes:
+    """XMP data as cameras and stitchers write them, as attributes or as elements."""
+    form = "<GPano:{0}>{1}</GPano:{0}>" if apart == "element" else " GPano:{0} = '{1}'"
+    return "".join(form.format(name, value) for name, value in said.items()).encode()
+
+
+SIDES = {"FullPanoWidthPixels": 8000, "FullPanoHeightPixels": 4000}
+WHOLE = {**SIDES, "CroppedAreaImageWidthPixels": 8000, "CroppedAreaImageHeightPixels": 4000}
+PART = {**SIDES, "CroppedAreaImageWidthPixels": 4000, "CroppedAreaImageHeightPixels": 2000}
+
+
+@pytest.mark.parametrize("apart", ["element", "attribute"])
+@pytest.mark.parametrize(
+    ("kind", "said", "around"),
+    [
+        ("equirectangular", WHOLE, True),  # and resized since
+        ("Equirectangular", {}, True),
+        ("equirectangular", PART, False),  # of a drone or a phone, 180 x 90 degrees: 2:1 as well
+        ("cylindrical", {}, False),
+        ("rectilinear", {}, None),
+    ],
+)
+def test_tags_tell_whole_spheres_from_parts(
+    kind: str, said: dict[str, int], around: bool | None, apart: str, tmp_path: Path
+) -> None:
+    save(tmp_path, "a.jpg b.jpg c.jpg", xmp=gpano(apart, ProjectionType=kind, **said))
+    assert read_exif(tmp_path / "a.jpg").panorama is around
+    if around is False:
+        with pytest.raises(ValueError, match="tagged as panoramas, but do not show the whole sphere"):
+            looked_at(tmp_path)
+        save(tmp_path, "d.jpg e.jpg f.jpg g.jpg")  # photos, of which it is none
+        assert looked_at(tmp_path).names == ["d.jpg", "e.jpg", "f.jpg", "g.jpg"]
+    else:
+        assert looked_at(tmp_path).around == bool(around)
 
 
 def test_faces_of_one_photo_are_no_pair() -> None:

@@ -73,11 +73,12 @@ def run(args: ExportScene) -> int:
     from hqgs.show.export import export, measure
 
     gaussians, run = Gaussians.load(source), RunFolder.open(args.source)
+    known = gaussians.along(run.cameras)
     scene = None if args.scene is None else _held_out_photos(run, args)
     if args.trust:
         from hqgs.show.trust import trust_of
 
-        gaussians.errors = trust_of(gaussians, gaussians.along(run.cameras)).errors.clamp(max=1)
+        gaussians.errors = trust_of(gaussians, known).errors.clamp(max=1)
 
     def held_out(shown: Gaussians) -> float | None:
         if scene is None:
@@ -90,7 +91,7 @@ def run(args: ExportScene) -> int:
     back = Gaussians.load(args.out, options.format)
     after = held_out(back)
     try:
-        changed = f"measured: {measure(gaussians, back, run.cameras)}"
+        changed = f"measured: {measure(gaussians, back, known)}"
     except ValueError as error:
         changed = f"not measured: {error}"
     print(_table(source, gaussians, before, written, after), end="\n\n")

@@ -156,7 +156,7 @@ def _cameras(
         if not Path(path).is_file():
             raise FileNotFoundError(f"--path is {path!r}: no such file, and none of: {', '.join(PATHS)}")
         own, rate = load_path(path)
-        return None, [moved(camera, gaussians.world, gaussians.moved) for camera in own], rate
+        return None, [moved(camera, (known or gaussians).world, gaussians.moved) for camera in own], rate
     if known is None or not known.train:
         return None, orbit(gaussians, count, up=options.up or gaussians.world.up or UP), FPS
     if options.up is not None and path != "orbit":

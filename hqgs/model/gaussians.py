@@ -33,6 +33,7 @@ from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.photos.pixels import png
 from hqgs.scene.camera_files import RunCameras, first_camera, moved_along
 from hqgs.scene.constants import BACKGROUND, SMALLEST, USUAL
+from hqgs.scene.geometry import in_frame
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
 from hqgs.scene.world import World
@@ -120,16 +121,25 @@ class Gaussians:
         return replace(self, **held, world=world, look=None)
 
     def along(self, known: RunCameras | None) -> RunCameras | None:
-        """The cameras that lie beside the scene's file, with the scene where another program moved that."""
-        if known is None or self.moved is None:
-            return known
-        return moved_along(known, self.world, self.moved)
+        """The cameras that lie beside the scene's file, in the frame in which the scene is held.
+
+        A file that says no frame may have lost what lay beside it: cameras stay where they show more of it.
+        """
+        if known is None:
+            return None
+        there = moved_along(known, self.world, self.moved)
+        if there is known or self.moved is not None or self.world != World():
+            return there
+        few = self._few()
+        return max((there, known), key=lambda one: sum(in_frame(c, few).sum() for c in one.train))
 
     def near_plane(self) -> float:
         """What is nearer to a camera than this is not rendered: less in a scene of small units."""
+        return near_for(self._few())
+
+    def _few(self) -> NDArray[np.float64]:
         few = self.means.detach()[:: max(1, len(self) // CONTENT_SAMPLED)].double().numpy()
-        few = few[np.isfinite(few).all(1)]
-        return near_for(few)
+        return few[np.isfinite(few).all(1)]
 
     def detached(self) -> Gaussians:
         """The same values (shared memory) without a gradient history."""
@@ -265,13 +275,14 @@ class Gaussians:
         """
         file = scene_file(path)
         arrays = read_scene(file, format_of(file, format))
+        world, moved = arrays.get("world", World()), arrays.get("moved")
         return cls(
             **{name: torch.from_numpy(np.ascontiguousarray(arrays[name])) for name in TENSORS},
-            look=first_camera(file.parent) if file.name == PLY else None,
-            world=arrays.get("world", World()),
+            look=first_camera(file.parent, world, moved) if file.name == PLY else None,
+            world=world,
             antialiased=arrays.get("antialiased", False),
             notes=arrays.get("notes", []),
-            moved=arrays.get("moved"),
+            moved=moved,
             errors=torch.from_numpy(arrays["errors"]) if "errors" in arrays else None,
         )
 

@@ -14,7 +14,9 @@ _ORIENTATION, _MAKE, _MODEL, _MORE = 274, 271, 272, 0x8769  # tags; the last one
 _FOCAL, _FOCAL_35MM, _WIDTH, _HEIGHT = 37386, 41989, 40962, 40963
 _X_RESOLUTION, _RESOLUTION_UNIT = 41486, 41488
 _XMP = ("xmp", "XML:com.adobe.xmp")  # what Pillow calls it in JPEG, WebP and HEIC, and in PNG
-_PANORAMA = re.compile(rb"GPano:ProjectionType\W{1,3}equirectangular\b")  # an attribute, or an element
+_PANORAMA = re.compile(  # attributes, or elements
+    rb"GPano:(ProjectionType|(?:FullPano|CroppedAreaImage)(?:Width|Height)Pixels)\s*(?:=\s*[\"']|>)\s*(\w+)"
+)
 _GPS = 0x8825  # another such table, with these:
 _NORTH_OR_SOUTH, _LATITUDE, _EAST_OR_WEST, _LONGITUDE, _BELOW_SEA, _ALTITUDE = range(1, 7)
 _MM = {2: 25.4, 3: 10.0}  # of the units that resolutions come in
@@ -34,7 +36,7 @@ class Exif:
     camera: tuple[str, ...] = ()  # make, model and focal length: photos with the same ones share a camera
     focal: float = 0.0  # px of the stored photo
     gps: tuple[float, float, float] | None = None  # degrees north and east, m up; nan: no altitude
-    panorama: bool = False  # its XMP data (GPano) say that it is equirectangular
+    panorama: bool | None = None  # of the whole sphere, equirectangular, or not: by its XMP data (GPano)
     above: float = math.nan  # m above where a drone took off, by its barometer
     pitch: float | None = None  # degrees above level that its gimbal held the camera, upright
 
@@ -64,9 +66,8 @@ def read_exif(path: Path) -> Exif:
     lens = f"{_number(more, _FOCAL):g} {_number(more, _FOCAL_35MM):g}"
     known = any(names) or focal > 0
     xmp = xmp.encode(errors="replace") if isinstance(xmp, str) else bytes(xmp)
-    panorama = _PANORAMA.search(xmp) is not None
     named = (*names, lens) if known else ()
-    return Exif(orientation, named, focal, gps, panorama, *_of_drone(xmp))
+    return Exif(orientation, named, focal, gps, _around(xmp), *_of_drone(xmp))
 
 
 def _focal(more: dict[int, Any], width: int, height: int) -> float:
@@ -92,6 +93,18 @@ def _position(tags: dict[int, Any]) -> tuple[float, float, float] | None:
     if tags.get(_BELOW_SEA) in (b"\1", 1):
         up = -up
     return north, east, up if math.isfinite(up) else math.nan
+
+
+def _around(xmp: bytes) -> bool | None:
+    """Whether a photo is said to show the whole sphere; None where it is not said to be a panorama."""
+    told = {name.decode(): value.decode().lower() for name, value in _PANORAMA.findall(xmp)}
+    if (kind := told.get("ProjectionType", "rectilinear")) == "rectilinear":
+        return None
+    sides = (
+        (told.get(f"FullPano{side}Pixels"), told.get(f"CroppedAreaImage{side}Pixels"))
+        for side in ("Width", "Height")
+    )
+    return kind == "equirectangular" and all(None in (full, part) or full == part for full, part in sides)
 
 
 def _of_drone(xmp: bytes) -> tuple[float, float | None]:

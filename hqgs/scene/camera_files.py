@@ -17,6 +17,7 @@ from hqgs.photos.files import LARGEST
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.photos.video import FPS
 from hqgs.scene.constants import BACKGROUND, KEPT_SIDE
+from hqgs.scene.named_split import names_by_any
 from hqgs.scene.paths import scene_up, view_matrix
 from hqgs.scene.scene import Camera, Scene
 from hqgs.scene.world import World
@@ -138,7 +139,7 @@ N = TypeVar("N", bound=_HasName)
 
 
 def picked(train: Sequence[N], test: Sequence[N], which: str, whose: str) -> list[N]:
-    """Those that `which` means: train, test, all, or names with commas, with suffix or without.
+    """Those that `which` means: train, test, all, or names with commas, with suffix and folders or without.
 
     ValueError, which says `whose` they are, where there is none.
     """
@@ -147,22 +148,22 @@ def picked(train: Sequence[N], test: Sequence[N], which: str, whose: str) -> lis
         if not kinds[which]:
             raise ValueError(f"--views {which}: {whose} has no such photo")
         return [*kinds[which]]
-    named = {one.name: one for one in kinds["all"]}
-    named |= {Path(name).stem: one for name, one in named.items() if Path(name).stem not in named}
+    by_name = {one.name: one for one in kinds["all"]}
+    named = {called: by_name[name] for called, name in names_by_any([*by_name]).items()}
     wanted = [which] if which in named else [name.strip() for name in which.split(",")]
     if missing := [name for name in wanted if name not in named]:
-        known = ", ".join(["train", "test", "all", *[*named][:3]])
+        known = ", ".join(["train", "test", "all", *[*by_name][:3]])
         raise ValueError(f"--views: {whose} has no photo {missing[0]!r}; there are: {known}, ...")
     return [named[name] for name in wanted]
 
 
-def first_camera(folder: Path) -> Camera | None:
-    """The first camera of the run in a folder, a held-out one where there is one.
+def first_camera(folder: Path, world: World, by: NDArray[np.float64] | None) -> Camera | None:
+    """The first camera of the run in a folder, a held-out one where there is one, as `moved_along` moves it.
 
     None where none is kept, or where its file is damaged: it is for pictures that can do without.
     """
     try:
-        known = load_cameras(folder)
+        known = moved_along(load_cameras(folder), world, by)
     except (OSError, ValueError):
         return None
     return next(iter([*known.test, *known.train]), None)
@@ -203,14 +204,16 @@ def moved(camera: Camera, world: World, by: NDArray[np.float64] | None = None) -
     return replace(camera, viewmat=world.viewmat_into(viewmat))
 
 
-def moved_along(known: RunCameras, world: World, by: NDArray[np.float64]) -> RunCameras:
-    """The cameras of a run with its scene, which was moved and is held in `world`; see `moved`."""
+def moved_along(known: RunCameras, world: World, by: NDArray[np.float64] | None) -> RunCameras:
+    """The cameras of a run with its scene, which is held in `world`, and may have been moved; see `moved`."""
+    if by is None and known.world.frame == world.frame:
+        return known
 
     def along(view: KnownCamera) -> KnownCamera:
-        own = replace(view.camera, viewmat=known.world.viewmat_out(view.camera.viewmat))
-        return replace(view, camera=moved(own, world, by))
+        files = known.world.viewmat_to(World(metres=world.metres), view.camera.viewmat)
+        return replace(view, camera=moved(replace(view.camera, viewmat=files), world, by))
 
-    up = by[:3, :3] @ known.up
+    up = known.up if by is None else by[:3, :3] @ known.up
     return replace(known, up=up / np.linalg.norm(up), views=[*map(along, known.views)], world=world)
 
 

@@ -35,10 +35,10 @@ def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -
 
     ValueError where panoramas are parts of a sphere, or too few.
     """
-    tagged = [name for name, tags in exif.items() if tags.panorama]
+    tagged = [name for name, tags in exif.items() if tags.panorama is not None]
     whole = [name for name, seen in looked.items() if seen.size[0] == 2 * seen.size[1]]
-    found = [name for name in whole if name in set(tagged)]
-    untold = [name for name in whole if name not in set(tagged)]
+    found = [name for name in whole if exif[name].panorama]
+    untold = [name for name in whole if exif[name].panorama is None]
     if 2 * len(untold) > len(looked):
         picks = [untold[k] for k in evenly(len(untold), PROBED)]
         closed = [name for name in picks if _closes(folder / name)]
@@ -50,18 +50,19 @@ def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -
         name = tagged[0]
         width, height = looked[name].size
         raise ValueError(
-            f"{folder}: {len(tagged)} of {len(looked)} photos are tagged as panoramas, but are not twice "
-            f"as wide as high ({name}: {width} x {height} px): export the whole sphere, 360 x 180 degrees"
+            f"{folder}: {len(tagged)} of {len(looked)} photos are tagged as panoramas, but do not show the "
+            f"whole sphere, twice as wide as high ({name}: {width} x {height} px): export the whole sphere, "
+            "360 x 180 degrees, equirectangular"
         )
-    flat = [name for name in looked if name not in set(found)]
+    flat = [name for name in looked if name not in {*found, *tagged}]
     if len(flat) >= max(len(found), LEAST_PHOTOS):
-        return False, found
+        return False, [name for name in looked if name not in set(flat)]
     if found and len(found) < LEAST_PHOTOS:
         raise ValueError(
             f"{folder}: {len(found)} panorama{'s' * (len(found) > 1)} of 360 x 180 degrees ({some(found)}) "
             f"show no depth, wanted at least {LEAST_PHOTOS}: take 10 to 50, a step apart"
         )
-    return bool(found), flat if found else []
+    return bool(found), [name for name in looked if found and name not in set(found)]
 
 
 def _closes(path: Path) -> bool:
@@ -85,7 +86,7 @@ def _stands_still(folder: Path, names: list[str]) -> bool:
         pixels = decode(folder / name)[0].astype(np.float32)
         edge = max(1, pixels.shape[1] // 32)
         rows = np.concatenate([pixels[:, :edge].mean((1, 2)), pixels[:, -edge:].mean((1, 2))])
-        borders.append([part.mean() for part in np.array_split(rows, 64)])
+        borders.append([part.mean() / max(rows.mean(), 1e-6) for part in np.array_split(rows, 64)])
     off = np.std(borders, axis=0)
     return len(names) > 1 and float(np.median(off)) < STILL * float(np.std(borders, axis=1).mean())
 
