@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import hqgs
-from benchmarks import accuracy, endurance, everything, export, looks, parts, time
+from benchmarks import accuracy, endurance, everything, export, looks, parts, stages, time
 from benchmarks.command import Benchmark
 from benchmarks.pages import write as pages
 from benchmarks.protocol import add_options
@@ -19,7 +19,7 @@ from benchmarks.stability import run as stability
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.training.trainer import TrainingError
 
-MODULES = (accuracy, endurance, export, looks, parts, quality, speed, stability, time)
+MODULES = (accuracy, endurance, export, looks, parts, quality, speed, stability, stages, time)
 BENCHMARKS: dict[str, Benchmark] = {m.__name__.split(".")[1]: m.BENCHMARK for m in MODULES}
 OTHERS: dict[str, Callable[[argparse.Namespace], list[str]]] = {"all": everything.run, "pages": pages.run}
 
