@@ -53,7 +53,7 @@ def measure(tree: Path, scene: str, options: list[str], folder: Path) -> dict[st
     seconds, after = time.perf_counter() - start, os.times()
     if done.returncode:
         raise RuntimeError(f"{tree}: {' '.join(command)} failed: {done.stderr[-2000:]}")
-    metrics = json.loads((folder / REPORT).read_text(encoding="utf-8"))["metrics"]
+    metrics = json.loads((folder / REPORT).read_text(encoding="utf-8"))["metrics"]["mean"]
     cpu = after.children_user + after.children_system - before.children_user - before.children_system
     row = {"seconds": seconds, "cpu_seconds": cpu, "psnr": metrics["psnr"], "ssim": metrics["ssim"]}
     return row | {"stages": parts_of(done.stdout + done.stderr)}
