@@ -29,7 +29,7 @@ from benchmarks.study import Cell, Study, begin
 from benchmarks.without import without
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
-from hqgs.training.config import AUTO
+from hqgs.training.config import AUTO, NONE
 from hqgs.training.trainer import Trainer
 
 ALL = "all"
@@ -123,9 +123,11 @@ class Parts:
         return whole | {"on": on, "start": start} | told(part)
 
     def placed_anew(self, cell: Cell) -> Scene:
-        """The scene with cameras that are found without the part."""
+        """The scene with cameras that are found without the part. ValueError where photos are degraded."""
         keep = self.study.args.out / "scenes" / f"{cell.scene.name} without {cell.row.label}"
         longest = self.study.protocol.longest
+        if cell.degradation != NONE:
+            raise ValueError(f"{cell.row.label}: cameras are found anew in captures as they are")
         return load_scene(
             self.folders[cell.scene.name], downscale=cell.downscale, keep_sfm=keep, longest=longest
         )
