@@ -104,6 +104,7 @@ class Parts:
     def measure(self, cell: Cell, photos: Scene) -> Run:
         part = cell.row
         assert isinstance(part, Part)
+        what = told(part)  # with the functions as they are
         with without(part.without):
             if part.poses:
                 photos = self.placed_anew(cell)
@@ -112,7 +113,7 @@ class Parts:
             known = self.study.runs.get(self.whole[cell.group])
             if known is not None and known["start"] == start:
                 whole = {name: float(known[name]) for name in MEASURES}
-                return whole | {"on": False, "start": start} | told(part)
+                return whole | {"on": False, "start": start} | what
             done.steps()
         placed = len(photos.train) + len(photos.test)
         cpu = done.setup_cpu_seconds + done.cpu_seconds
@@ -120,7 +121,7 @@ class Parts:
         whole = {name: found[name] for name in MEASURES}
         same = ("psnr", "ssim", "gaussians")
         on = part.label == ALL or known is None or any(text_of(whole[one]) != known[one] for one in same)
-        return whole | {"on": on, "start": start} | told(part)
+        return whole | {"on": on, "start": start} | what
 
     def placed_anew(self, cell: Cell) -> Scene:
         """The scene with cameras that are found without the part. ValueError where photos are degraded."""
