@@ -9,7 +9,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from benchmarks import parts, stages
+from benchmarks import looks, parts, stages
 from benchmarks.pages import charts, figures, sections
 from benchmarks.protocol import read_toml
 from benchmarks.rows import KEYS, Table
@@ -21,7 +21,7 @@ DOCS = HERE.parents[1] / "docs"
 HELP = "write the pages of results from their tables"
 RESULTS = Path("results")  # in the folder of the documentation: pages and tables
 INDEX = "results.md"
-HELPERS = (figures, parts, sections, stages)  # whose functions the templates call
+HELPERS = (figures, looks, parts, sections, stages)  # whose functions the templates call
 
 
 def tables(folder: Path) -> dict[str, Any]:
