@@ -65,7 +65,9 @@ def test_up_is_sought_where_a_scene_is_to_be_trained(room: Scene, tmp_path: Path
     views = [*room.train, *room.test]
     for view in views:
         Image.fromarray(view.image).save(tmp_path / "images" / view.name)
-    points = np.random.default_rng(2).uniform([-1, -1, 2], [1, 1, 4], (8, 3))
+    shown = np.random.default_rng(2).uniform([-1, -1, 2], [1, 1, 4], (8, 3))  # before the first camera
+    viewmat = views[0].camera.viewmat
+    points = (shown - viewmat[:3, 3]) @ viewmat[:3, :3]
     cameras = {view.name: view.camera for view in views}
     write_colmap(tmp_path / "sparse" / "0", cameras, points, np.zeros((8, 3), np.uint8), None, 0.0)
     told = load(tmp_path, test_every=0)

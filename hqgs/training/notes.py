@@ -19,12 +19,13 @@ from hqgs.training.rules import MOST_ITERATIONS
 from hqgs.training.trainer import Trainer
 
 _POOR, _ASKED = 20.0, 4  # dB, above which no run has failed; photos that are asked
+_LOOKS = 3  # at each photo, before which a run is a try and no failure
 
 
 def fell_short(trainer: Trainer) -> str | None:
     """What to say of a poor run that ends far below where it began; see `fallen`."""
     last = trainer.history[-1]["psnr"] if trainer.history else None
-    if last is not None and last > _POOR:
+    if last is not None and last > _POOR or trainer.iteration < _LOOKS * len(trainer.scene.train):
         return None
     scene, background = trainer.prepared.given, trainer.config.background
     views = scene.test or scene.train
