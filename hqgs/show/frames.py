@@ -164,7 +164,8 @@ class Activated:
         with one_torch_thread():
             g = g.rows(torch.from_numpy(curve_order(g.means.numpy())))
         self.degree: int = g.sh_degree
-        self.gaussians, self._near = g, g.near_plane()
+        self.gaussians: Gaussians = g
+        self._near = g.near_plane()
         tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities(), g.sh0
         rest = g.shN.contiguous().numpy() if g.sh_degree else None
         means, quats, scales, opacities, sh0 = (tensor.contiguous().numpy() for tensor in tensors)
