@@ -234,8 +234,8 @@ def _fitting(first: View, second: View, photos: Mapping[str, Photo], ways: Seque
     return np.array([*found, len(points)])
 
 
-def unseen(views: Sequence[View], points: NDArray[np.floating]) -> list[str]:
-    """What to say of points [P, 3] that no photo shows, and of photos that show none.
+def unseen(name: object, views: Sequence[View], points: NDArray[np.floating]) -> list[str]:
+    """What to say of points [P, 3] of the scene `name` that no photo shows, and of photos that show none.
 
     ValueError where no photo shows any: nothing could be trained on.
     """
@@ -253,8 +253,8 @@ def unseen(views: Sequence[View], points: NDArray[np.floating]) -> list[str]:
         if not before:
             where = "behind all cameras: do the poses have the axes and the direction of their format?"
         raise ValueError(
-            f"no photo shows any of the {len(points)} points, which lie {where} `--sfm` finds cameras and "
-            "points from the photos instead"
+            f"{name}: no photo shows any of the {len(points)} points, which lie {where} `--sfm` finds "
+            "cameras and points from the photos instead"
         )
     notes = []
     if (share := 1 - shown.mean() if len(shown) else 0) > _MANY:

@@ -133,7 +133,7 @@ def _views(
     if degraded is not None:
         views = _with_lows(views, degraded, root, optional, unreadable)
     if capture.source != "photos":
-        notes += unseen(views, capture.points)
+        notes += unseen(root, views, capture.points)
     if not names - held_out:
         raise ValueError(f"{root}: all {len(views)} photos are held out, none is left to train on")
     for those, what in ((names - held_out, "training"), (names & held_out, "held-out")):

@@ -46,7 +46,7 @@ class Frame:
         """ValueError where the scene has no training view, or none of them shows a point."""
         scene.check_trainable()
         scene = with_first_points(scene)
-        unseen(scene.train, scene.points)
+        unseen(scene.name, scene.train, scene.points)
         axes = scene.train[0].camera.viewmat[:3, :3]
         centers = np.stack([view.camera.center for view in scene.train])
         middle, size = middle_and_size(_turned(centers, axes), _turned(scene.points, axes))

@@ -25,7 +25,7 @@ _LOOKS = 3  # at each photo, before which a run is a try and no failure
 def fell_short(trainer: Trainer) -> str | None:
     """What to say of a poor run that ends far below where it began; see `fallen`."""
     last = trainer.history[-1]["psnr"] if trainer.history else None
-    if last is not None and last > _POOR or trainer.iteration < _LOOKS * len(trainer.scene.train):
+    if (last is not None and last > _POOR) or trainer.iteration < _LOOKS * len(trainer.scene.train):
         return None
     scene, background = trainer.prepared.given, trainer.config.background
     views = scene.test or scene.train
