@@ -59,7 +59,7 @@ def measure(tree: Path, scene: str, options: list[str], folder: Path) -> dict[st
     return row | {"stages": parts_of(done.stdout + done.stderr)}
 
 
-def stages_table(runs: pd.DataFrame) -> str:
+def whole_table(runs: pd.DataFrame) -> str:
     """A line for each scene: this checkout's medians, and their ratios to the other's in the same rounds."""
     body = []
     for scene in dict.fromkeys(runs["scene"]):
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> list[str]:
                     print(f"stages: {name}, {row}: {line['seconds']} s", file=sys.stderr, flush=True)
     lines = [line for line in kept.rows() if line["scene"] in scenes and line["preset"] == args.preset]
     runs = pd.DataFrame(lines)
-    return [stages_table(runs.assign(**{name: pd.to_numeric(runs[name]) for name in NUMBERS}))]
+    return [whole_table(runs.assign(**{name: pd.to_numeric(runs[name]) for name in NUMBERS}))]
 
 
 OPTIONS: dict[str, dict[str, Any]] = {
