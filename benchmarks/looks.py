@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from pandas import DataFrame
 
@@ -116,18 +117,21 @@ def measure(cell: Cell, photos: Scene) -> Run:
 
 
 def looks_table(runs: DataFrame) -> str:
-    """A line for each look that is found, or was put on."""
-    heads = ("capture", "photos", "seed", "part", "found", "on", "gain (dB)", "gain as shown (dB)", "off by")
-    body = list[list[str]]()
+    """A line for each look that is put on, and for each that is found beside it, over captures and seeds."""
+    found = list[dict[str, Any]]()
     for line in runs.to_dict("records"):
         gains, shown, off = (dict(pairs_of(line[name])) for name in ("gain", "gain_shown", "off"))
-        start = [line["scene"], line["row"], f"{line['seed']}"]
-        if not gains:
-            body.append([*start, "none", *["–"] * 5])
-        for kind, gain in gains.items():
-            is_in = ["yes" if kind in line[name].split("+") else "no" for name in ("found", "learned")]
-            numbers = [number(gain, "+.2f"), number(shown[kind], "+.2f"), number(off.get(kind), ".0%")]
-            body.append([*start, kind, *is_in, *numbers])
+        for kind in gains or ["none"]:
+            one = {"photos": line["row"], "part": kind, "gain": gains.get(kind), "shown": shown.get(kind)}
+            one |= {name: kind in line[name].split("+") for name in ("found", "learned")}
+            found.append(one | {"off": off.get(kind)})
+    body = list[list[str]]()
+    for (photos, part), those in DataFrame(found).groupby(["photos", "part"], sort=False):
+        cells = [f"{those[name].sum()} of {len(those)}" for name in ("found", "learned")]
+        forms = {"gain": "+.2f", "shown": "+.2f", "off": ".0%"}
+        means = [number(pd.to_numeric(those[name]).mean(), form) for name, form in forms.items()]
+        body.append([str(photos), str(part), *cells, *means])
+    heads = ("photos", "part", "found", "on", "gain (dB)", "gain as shown (dB)", "off by")
     return table(heads, body)
 
 
