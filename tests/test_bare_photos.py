@@ -220,7 +220,7 @@ def test_the_world_stands_upright_and_every_photo_is_named(photos: list[np.ndarr
     pictures = load_pictures(tmp_path, most=4)
     assert pictures is not None
     assert len(pictures.train) == 4
-    assert pictures.notes == ["cannot be read (1): zz.png"]
+    assert pictures.notes == ["10 photos, no camera in EXIF", "cannot be read (1): zz.png"]
 
 
 def test_a_stopped_reconstruction_goes_on_where_it_was(

@@ -10,9 +10,11 @@ import pycolmap
 import pytest
 from fixtures_scenes import Truth, make_truth, photographed, write_colmap
 from numpy.typing import NDArray
+from PIL import Image
 
 import hqgs
 from benchmarks.scenes.sparse import sparse_cameras
+from hqgs.cli.main import main
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, View
 
@@ -88,6 +90,24 @@ def test_poses_of_another_kind_are_turned(poses, said: str | None, grey: bool, t
     told = [note for note in scene.notes if "as the files have them" in note]
     assert len(told) == (said is not None)
     assert said is None or said in told[0]
+
+
+def test_plan_judge_and_info_say_what_was_done_with_poses_and_masks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = colored()
+    root = written(replace(truth, viewmats=np.linalg.inv(truth.viewmats)), tmp_path / "scene")
+    for name in truth.names:
+        mask = Image.fromarray(np.full((truth.height, truth.width), 255, np.uint8))
+        mask.save(root / "images" / f"{Path(name).stem}_sam_mask.png")
+    hqgs.Gaussians.from_points(truth.points, truth.colors, 0).save(tmp_path / "a.ply")
+    for command in (["plan", root], ["judge", tmp_path / "a.ply", "--photos", root]):
+        assert main([str(part) for part in command]) == 0
+        told = " ".join("".join(capsys.readouterr()).split())
+        assert told.count("poses are read as camera to world") == 1
+        assert told.count("9 of 9 photos have a mask") == 1
+    assert main(["info", str(root)]) == 0
+    assert "masks: of 9 photos" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

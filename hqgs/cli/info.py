@@ -108,6 +108,7 @@ def _photos(path: Path) -> list[str]:
     from hqgs.model.formats.files import FORMATS  # here: they load torch
     from hqgs.scene.checks import beside
     from hqgs.scene.load import formats_of, scene_folder
+    from hqgs.scene.masks import masks_of
     from hqgs.scene.sfm.bare_photos import bare_photos, readable
 
     root, inside = scene_folder(path)
@@ -129,5 +130,7 @@ def _photos(path: Path) -> list[str]:
     ]
     others = beside(root, photos.folder) if formats else []  # they are read
     lines += [*inside, *(note for note in photos.notes if note not in others)]
+    if count := len(masks_of(root, photos.folder, photos.names)):
+        lines.append(f"masks: of {count} photos")
     lines += [f"cannot be read: {name} ({why})" for name, why in photos.unreadable.items()]
     return lines

@@ -63,6 +63,8 @@ def run(options: PlanOptions) -> int:
     photos = f"{scene.of or len(scene.train)} photos to train on"
     looked = f" ({len(scene.train)} of them measured)" if scene.of not in (None, len(scene.train)) else ""
     print(f"{scene.name}: {photos}{looked}, {len(scene.points):,} points")
+    for note in scene.notes:
+        print(f"  {note}")
     print(plan)
     if later:
         print(

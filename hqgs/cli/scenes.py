@@ -127,7 +127,7 @@ def measured_scene(run: RunFolder, asked: Measured, screen: LoadingScreen) -> Sc
             raise ValueError(
                 f"{source} is measured on the photos of its run: --downscale and --test-every need --photos"
             )
-        return run.photos(screen.stage)
+        return _heard(run.photos(screen.stage), screen)
     bare = film_at(photos) is not None or not (
         is_room(photos) or formats_of(scene_folder(photos)[0], asked.downscale or 1.0)
     )
@@ -149,11 +149,18 @@ def measured_scene(run: RunFolder, asked: Measured, screen: LoadingScreen) -> Sc
     )
     if bare:
         check_same(scene, run, split=False)
-    split = run.split(scene)
+    split = run.split(_heard(scene, screen))
     if test_every is None:
         return split
     if seen := sorted({view.name for view in scene.test} & {view.name for view in split.train}):
         screen.say(f"warning: --test-every holds out photos that the run was trained on: {some(seen)}")
+    return scene
+
+
+def _heard(scene: Scene, screen: LoadingScreen) -> Scene:
+    """The scene, when its notes were said."""
+    for note in scene.notes:
+        screen.say(note)
     return scene
 
 

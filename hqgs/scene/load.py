@@ -188,9 +188,9 @@ def load_pictures(
         shown = replace(shown, downscale=bound(sizes, photos.downscale, longest))
     views, _ = load_views(shown.photos, shown.downscale)
     notes = [f"cannot be read ({len(photos.unreadable)}): {some(sorted(photos.unreadable))}"]
+    notes = [*photos.notes, *(notes if photos.unreadable else [])]
     nothing = no_points()
     points, colors = nothing[0].astype(np.float32), nothing[1]
-    notes = notes if photos.unreadable else []
     of = len(trained) * (len(CUBE) if photos.around else 1)
     return Scene(root.name, views, [], points, colors, "photos", notes, of=of)
 
