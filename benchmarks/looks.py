@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from pandas import DataFrame
 
 from benchmarks.command import Benchmark
 from benchmarks.measure import Run
-from benchmarks.pages.figures import number, table
+from benchmarks.pages.figures import number, pick, table
 from benchmarks.protocol import Row, read_protocols
 from benchmarks.rows import pairs_of
 from benchmarks.study import Cell, finished
@@ -33,6 +32,7 @@ from hqgs.training.config import AUTO
 from hqgs.training.frame import Frame
 from hqgs.training.trainer import Trainer
 
+AS_THEY_ARE, FOUND = "as they are", ("found", "learned")
 CAMERAS = "a", "b"  # that take photos in turn, where a response is put on
 
 
@@ -117,22 +117,19 @@ def measure(cell: Cell, photos: Scene) -> Run:
 
 
 def looks_table(runs: DataFrame) -> str:
-    """A line for each look that is put on, and for each that is found beside it, over captures and seeds."""
-    found = list[dict[str, Any]]()
-    for line in runs.to_dict("records"):
-        gains, shown, off = (dict(pairs_of(line[name])) for name in ("gain", "gain_shown", "off"))
-        for kind in gains or ["none"]:
-            one = {"photos": line["row"], "part": kind, "gain": gains.get(kind), "shown": shown.get(kind)}
-            one |= {name: kind in line[name].split("+") for name in ("found", "learned")}
-            found.append(one | {"off": off.get(kind)})
+    """A line for each look that is put on, over captures and seeds."""
     body = list[list[str]]()
-    for (photos, part), those in DataFrame(found).groupby(["photos", "part"], sort=False):
-        cells = [f"{those[name].sum()} of {len(those)}" for name in ("found", "learned")]
-        forms = {"gain": "+.2f", "shown": "+.2f", "off": ".0%"}
-        means = [number(pd.to_numeric(those[name]).mean(), form) for name, form in forms.items()]
-        body.append([str(photos), str(part), *cells, *means])
-    heads = ("photos", "part", "found", "on", "gain (dB)", "gain as shown (dB)", "off by")
-    return table(heads, body)
+    for photos in dict.fromkeys(runs["row"]):
+        lines = pick(runs, row=photos).to_dict("records")
+        kind = str(photos).split()[0]
+        cells = [f"{sum(kind in line[name].split('+') for line in lines)} of {len(lines)}" for name in FOUND]
+        if photos == AS_THEY_ARE:
+            cells = [f"{sum(bool(line[name]) for line in lines)} of {len(lines)}" for name in FOUND]
+        for name, form in (("gain", "+.2f"), ("gain_shown", "+.2f"), ("off", ".0%")):
+            values = [value for line in lines for one, value in pairs_of(line[name]) if one == kind]
+            cells.append(number(float(np.mean(values)) if values else None, form))
+        body.append([str(photos), *cells])
+    return table(("photos", "found", "on", "gain (dB)", "gain as shown (dB)", "off by"), body)
 
 
 def run(args: argparse.Namespace) -> list[str]:

@@ -169,7 +169,7 @@ def parts_table(runs: DataFrame) -> str:
     body = list[tuple[float, list[str]]]()
     for label in dict.fromkeys(runs["row"]):
         mine = pick(runs, row=label)
-        if label == ALL:
+        if label == ALL or label not in PARTS:  # that have left
             continue
         psnr, ssim, seconds, placed = (
             gains_of(runs, label, name) for name in ("psnr", "ssim", "cpu_seconds", "placed")
