@@ -422,9 +422,15 @@ def xml(kind: str, stereo: str = "") -> bytes:
     return box(b"uuid", UUID + f"<rdf:SphericalVideo>{text}</rdf:SphericalVideo>".encode())
 
 
-def second(kind: bytes, mode: int) -> bytes:
+def cropped(width: int) -> bytes:
+    sides = {"FullPanoWidthPixels": 8000, "CroppedAreaImageWidthPixels": width}
+    return "".join(f"<GSpherical:{k}>{v}</GSpherical:{k}>" for k, v in sides.items()).encode()
+
+
+def second(kind: bytes, mode: int, bounds: tuple[int, ...] = (0, 0, 0, 0)) -> bytes:
     st3d = box(b"st3d", bytes(4) + bytes([mode]))
-    proj = box(b"proj", box(b"prhd", bytes(16)) + box(kind, bytes(20)))
+    sides = b"".join(bound.to_bytes(4, "big") for bound in bounds)  # top, bottom, left, right; of 2^32
+    proj = box(b"proj", box(b"prhd", bytes(16)) + box(kind, bytes(4) + sides))
     return st3d + box(b"sv3d", box(b"svhd", bytes(5)) + proj)
 
 
@@ -436,6 +442,12 @@ def second(kind: bytes, mode: int) -> bytes:
         (second(b"equi", 0), ("equirectangular", "mono")),
         (second(b"equi", 2), ("equirectangular", "left-right")),
         (second(b"cbmp", 0), ("cubemap", "mono")),
+        (second(b"equi", 0, (0, 0, 2**30, 2**30)), ("a part of the sphere", "mono")),  # 180 degrees
+        (
+            xml("equirectangular").replace(b"</rdf", cropped(4000) + b"</rdf"),
+            ("a part of the sphere", "mono"),
+        ),
+        (xml("equirectangular").replace(b"</rdf", cropped(8000) + b"</rdf"), ("equirectangular", "mono")),
         (box(b"mvhd", bytes(100)), None),
     ],
 )
