@@ -33,7 +33,6 @@ from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.photos.pixels import png
 from hqgs.scene.camera_files import RunCameras, first_camera, moved_along
 from hqgs.scene.constants import BACKGROUND, SMALLEST, USUAL
-from hqgs.scene.geometry import in_frame
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
 from hqgs.scene.world import World
@@ -131,6 +130,8 @@ class Gaussians:
         if there is known or self.moved is not None or self.world != World():
             return there
         few = self._few()
+        from hqgs.scene.geometry import in_frame  # here: it loads SciPy, which rendering needs nowhere else
+
         return max((there, known), key=lambda one: sum(in_frame(c, few).sum() for c in one.train))
 
     def near_plane(self) -> float:
