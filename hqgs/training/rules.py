@@ -156,7 +156,8 @@ def formation(draft: Draft) -> None:
         for name, needed, why in diagnosis.needs():
             if not needed:
                 what = CORRECTION + name
-                draft.note("none", f"not needed: {why}", what=what, left_out=what)
+                why = why if why.startswith("not measured") else f"not needed: {why}"
+                draft.note("none", why, what=what, left_out=what)
         why = "in short test runs it did not improve the validation photos"
         for name in looks:
             if name in out:
