@@ -15,6 +15,7 @@ from PIL import Image
 import hqgs
 from benchmarks.scenes.sparse import sparse_cameras
 from hqgs.cli.main import main
+from hqgs.evaluation.verdict import fallen
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, View
 
@@ -169,3 +170,11 @@ def test_a_run_that_ends_below_one_flat_colour_says_so(tmp_path: Path) -> None:
     assert run.report.get("fallen") == run.report["notes"][0]
     sound = hqgs.load("embedded", downscale=12)
     assert "fallen" not in hqgs.train(sound, iterations=40, method="3dgs").report
+
+
+def test_a_run_that_ends_below_its_first_step_says_so() -> None:
+    told = fallen(9.0, 8.5, 14.0)
+    assert told is not None
+    assert told.startswith("the last step is worse than the first one (9.0 dB, 14.0 dB)")
+    assert fallen(13.5, 8.5, 14.0) is None
+    assert fallen(None, 8.5, 14.0) is None
