@@ -13,7 +13,7 @@ from hqgs.base.options import Number, given
 from hqgs.cli.errors import fail
 from hqgs.cli.judge import check_source
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Measured, check_out_file, measured_scene, tell_read
+from hqgs.cli.scenes import MeasuredOptions, check_out_file, measured_scene, tell_read
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clean(Measured):
+class Clean(MeasuredOptions):
     """Options of `hqgs clean`."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]

@@ -11,7 +11,7 @@ import tyro
 from hqgs.base.options import Factor, Flag, Number, Unsaid, values
 from hqgs.base.text import markdown_table
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Measured, check_out_file, measured_scene, ready, tell_read
+from hqgs.cli.scenes import MeasuredOptions, check_out_file, measured_scene, ready, tell_read
 from hqgs.model.formats.files import FORMATS, WRITTEN, format_of, scene_file
 from hqgs.show.export_options import ExportOptions
 
@@ -120,7 +120,7 @@ def _held_out_photos(run: RunFolder, args: ExportScene) -> Scene:
     photos = str(args.scene)
     ready(photos)
     with LoadingScreen() as screen:
-        asked = Measured(source=args.source, photos=photos, downscale=args.downscale)
+        asked = MeasuredOptions(source=args.source, photos=photos, downscale=args.downscale)
         return measured_scene(run, asked, screen)
 
 

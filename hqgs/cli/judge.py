@@ -13,7 +13,7 @@ from hqgs import __version__
 from hqgs.base.files import CONFIG, write_json
 from hqgs.base.options import Color
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Measured, check_background, check_out_folder, measured_scene, ready
+from hqgs.cli.scenes import MeasuredOptions, check_background, check_out_folder, measured_scene, ready
 from hqgs.evaluation.verdict import judged_by, judgement
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ META = "meta.json"  # of a SOG scene that was unpacked
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judge(Measured):
+class Judge(MeasuredOptions):
     """Options of `hqgs judge`."""
 
     against: Annotated[Path | None, tyro.conf.arg(metavar="OTHER", help_behavior_hint="")] = None

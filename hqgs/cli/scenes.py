@@ -45,7 +45,7 @@ class Photos:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measured:
+class MeasuredOptions:
     """A scene file, and the photos that it is measured on."""
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -112,7 +112,7 @@ def check_background(background: Sequence[float]) -> None:
         raise ValueError(f"--background is {given}, wanted three numbers in 0..1; 1 is white")
 
 
-def measured_scene(run: RunFolder, asked: Measured, screen: LoadingScreen) -> Scene:
+def measured_scene(run: RunFolder, asked: MeasuredOptions, screen: LoadingScreen) -> Scene:
     """The photos that a scene file is measured with: those that are named, or those of its run.
 
     Where `test_every` is not said, those are held out that the run held out.

@@ -38,33 +38,33 @@ class Outcome:
     borne_out: float | None = None  # share of the inliers that the places of panoramas bear out
 
 
-class Check(NamedTuple):
+class Cause(NamedTuple):
     """A cause that passes over so many photos show, and what to do about it."""
 
     found: Callable[[int, Sequence[Outcome]], bool]
     advice: str
 
 
-CHECKS = (  # the first that is found counts
-    Check(
+CAUSES = (  # the first that is found counts
+    Cause(
         lambda photos, passes: _usual(passes[0].features) < FEW_FEATURES,
         "So few features mean that photos are blurred or dark, or surfaces have no texture: take sharp "
         "photos of things with texture",
     ),
-    Check(
+    Cause(
         lambda photos, passes: _pairs(passes[-1]) == 0,
         "The photos have enough detail, but do not overlap. Take each photo so that two thirds of it show "
         "what the next photo shows",
     ),
-    Check(
+    Cause(
         lambda photos, passes: any(one.registered for one in passes),
         "The other photos overlap too little with these: take more photos in between",
     ),
-    Check(
+    Cause(
         lambda photos, passes: photos < 10,
         "There are too few photos: take 20 to 100, a step apart, each overlapping the next",
     ),
-    Check(
+    Cause(
         lambda photos, passes: True,
         "The photos overlap, but were taken from one place, or from places too far apart: walk around the "
         "scene and take a photo at each step",
@@ -74,7 +74,7 @@ CHECKS = (  # the first that is found counts
 
 def why_few(photos: int, passes: Sequence[Outcome]) -> str:
     """Why few of the photos have a place, or none, with counts, and what to do; a sentence or two."""
-    advice = next(check.advice for check in CHECKS if check.found(photos, passes))
+    advice = next(cause.advice for cause in CAUSES if cause.found(photos, passes))
     return f"{counts(photos, passes)}. {advice}"
 
 
