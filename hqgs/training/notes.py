@@ -31,7 +31,8 @@ def fell_short(trainer: Trainer) -> str | None:
     views = scene.test or scene.train
     asked = [views[k] for k in evenly(len(views), _ASKED)]
     first = Gaussians.from_points(scene.points, scene.point_colors, 0)
-    ends = HeldOutViews(asked, trainer.model(), trainer.schedule.degree(trainer.iteration), background)
+    degree = trainer.schedule.degree(trainer.iteration)
+    ends = [*HeldOutViews(asked, trainer.model(), degree, background)]  # rendered once, read twice
     photos = [as_floats(view.image)[... if view.mask is None else view.mask].reshape(-1, 3) for view in asked]
     color = np.concatenate(photos).mean(0)
     flats = [replace(end, render=np.broadcast_to(color, end.photo.shape)) for end in ends]
