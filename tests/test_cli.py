@@ -208,8 +208,7 @@ def test_bad_input_is_one_line_and_exit_code_2_and_leaves_no_folder(
     command: str,
     message: str,
 ) -> None:
-    out = tmp_path / ("deep/run" if command.startswith("train") else "new")
-    assert call(*command.split(), "--out", out) == 2
+    assert call(*command.split(), "--out", tmp_path / "deep" / "new") == 2
     assert one_line(capsys).startswith(f"hqgs: {message}")
     assert list(tmp_path.iterdir()) == []
 

@@ -79,14 +79,19 @@ def check_new_folder(out: Path) -> None:
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """Yield a folder that is moved to `out`, a resolved path, at the end; after an error it is gone."""
+    """Yield a folder that is moved to `out`, a resolved path, at the end; after an error it is gone, and the
+    folders above it that were made for it."""
     check_new_folder(out)
+    made = missing_folders(out.parent)
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as name:
-        folder = Path(name) / out.name  # with the usual permissions; those around it are private
-        folder.mkdir()
-        yield folder.resolve()
-        folder.replace(out)
+    try:
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as name:
+            folder = Path(name) / out.name  # with the usual permissions; those around it are private
+            folder.mkdir()
+            yield folder.resolve()
+            folder.replace(out)
+    finally:
+        remove_empty(made)
 
 
 def keep_folder(source: Path, target: Path) -> None:
