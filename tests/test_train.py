@@ -19,6 +19,8 @@ from torch import Tensor
 from benchmarks.scenes.room.scene import embedded_scene
 from hqgs.base.files import CHECKPOINT, PLY
 from hqgs.base.interrupt import ENDINGS
+from hqgs.base.stages import Stage
+from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation import held_out
 from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import open_run, run_to_end, train
@@ -286,7 +288,11 @@ def test_a_second_ctrl_c_stops_at_once(probe: Probe, tmp_path: Path) -> None:
 
 
 def test_scenes_that_cannot_be_trained_are_refused() -> None:
-    s = tiny_scene()
+    s, asked = tiny_scene(), list[Stage]()
+    few = TrainConfig(densify=DensifyConfig(max_gaussians=39))
+    with pytest.raises(ValueError, match="max_gaussians is 39, but the scene starts with 40 points"):
+        Trainer(s, few, Inspector(asked.append))
+    assert not asked  # before anybody looks at the photos
     with pytest.raises(ValueError, match="scene 'tiny' has no training views"):
         Trainer(Scene(s.name, [], s.test, s.points, s.point_colors, s.source), tiny_config())
     view = View("odd.png", s.train[0].camera, s.train[0].image[:-1])

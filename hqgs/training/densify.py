@@ -45,10 +45,6 @@ class Densifier:
         self, config: DensifyConfig, extent: float, reach: float, seed: int, num_gaussians: int
     ) -> None:
         """`extent`, `reach`: the scene's, world units. `num_gaussians`: N at the start."""
-        if num_gaussians > config.max_gaussians:
-            raise ValueError(
-                f"max_gaussians is {config.max_gaussians}, but the scene starts with {num_gaussians} points"
-            )
         self.config = config
         self.extent = extent
         self.reach = reach

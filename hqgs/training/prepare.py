@@ -40,6 +40,8 @@ class Prepared:
         self._frame: Frame | None = scene if isinstance(scene, Frame) else None
         scene = scene.scene() if isinstance(scene, Frame) else scene
         scene.check_trainable()
+        if (most := asked.densify.max_gaussians) < len(scene.points):
+            raise ValueError(f"max_gaussians is {most}, but the scene starts with {len(scene.points)} points")
         scene = with_rounded_poses(scene)
         inspector = inspector or Inspector()
         unused = list[LeftOut]()
