@@ -21,7 +21,7 @@ from hqgs.base.state import own_state
 from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, RunRecord, WorldRecord
-from hqgs.evaluation.report import RunResult, measure, write_report
+from hqgs.evaluation.report import write_report
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import save_cameras
@@ -313,8 +313,7 @@ def _report(
         record["fallen"] = fell
     if out is not None and config.seconds is not None:
         write_json(out / PLAN, plan_values(config, rows))
-    result = RunResult(record, views)
-    report = measure(result) if out is None else write_report(out, result)
+    report = write_report(out, record, views)
     if out is not None:
         write_page(out / PAGE, Page(report, scene, model, views, diagnosis))
     return report

@@ -19,8 +19,8 @@ from hqgs.base import machine
 from hqgs.evaluation import report
 from hqgs.evaluation.held_out import RenderedView, measured
 from hqgs.evaluation.metrics import METRICS, evaluate_view
-from hqgs.evaluation.records import RunRecord, read_report
-from hqgs.evaluation.report import RunResult, write_report
+from hqgs.evaluation.records import Report, RunRecord, read_report
+from hqgs.evaluation.report import write_report
 
 HEIGHT, WIDTH = 40, 60
 
@@ -31,7 +31,8 @@ def view_of(name: str, error: float = 0.1, mask: np.ndarray | None = None) -> Re
     return RenderedView(name, photo, np.full((HEIGHT, WIDTH, 3), 0.4 + error, np.float32), mask)
 
 
-def result_of(*views: RenderedView, **changes: Any) -> RunResult:
+def written(out: Path, *views: RenderedView, **changes: Any) -> Report:
+    """The report of a run with these held-out views."""
     record: dict[str, Any] = {
         "scene": "desk",
         "source": "colmap",
@@ -59,7 +60,7 @@ def result_of(*views: RenderedView, **changes: Any) -> RunResult:
         "learned": [],
         "plan": [],
     }
-    return RunResult(cast(RunRecord, record | changes), list(views))
+    return write_report(out, cast(RunRecord, record | changes), list(views))
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -75,8 +76,7 @@ def strict_json(text: str) -> Any:
 
 
 def test_report_has_every_field_and_the_right_numbers(tmp_path: Path) -> None:
-    result = result_of(view_of("a.jpg", 0.1), view_of("b.jpg", 0.01))
-    returned = write_report(tmp_path / "out", result)
+    returned = written(tmp_path / "out", view_of("a.jpg", 0.1), view_of("b.jpg", 0.01))
     got = strict_json((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     assert got == returned == read_report(tmp_path / "out" / "report.json")
 
@@ -88,7 +88,9 @@ def test_report_has_every_field_and_the_right_numbers(tmp_path: Path) -> None:
         missing = {m for m in METRICS if values[m] is None}
         assert missing <= got["metrics"]["reasons"].keys()
 
-    assert {key: got[key] for key in result.record} == result.record
+    assert (got["scene"], got["seed"], got["length"]) == ("desk", 7, 400)
+    assert got["history"][1] == {"iteration": 300, "seconds": 12.5, "psnr": 21.0, "ssim": None}
+    assert got["config"] == {"iterations": 300, "lr": 1e-3}
     assert got["versions"]["numpy"] == np.__version__
     assert got["machine"]["cores"] >= 1
 
@@ -96,7 +98,7 @@ def test_report_has_every_field_and_the_right_numbers(tmp_path: Path) -> None:
 def test_infinite_psnr_is_null_with_a_reason(tmp_path: Path) -> None:
     photo = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     perfect = RenderedView("same", photo, np.ones((HEIGHT, WIDTH, 3), np.float32))
-    got = write_report(tmp_path, result_of(perfect, view_of("other")))
+    got = written(tmp_path, perfect, view_of("other"))
     assert got["metrics"]["views"][0]["psnr"] is None
     assert got["metrics"]["mean"]["psnr"] is None
     assert got["metrics"]["reasons"]["psnr"] == (
@@ -108,7 +110,7 @@ def test_infinite_psnr_is_null_with_a_reason(tmp_path: Path) -> None:
 def test_comparison_shows_photo_render_and_amplified_difference(tmp_path: Path) -> None:
     mask = np.ones((HEIGHT, WIDTH), bool)
     mask[:, :10] = False
-    got = write_report(tmp_path, result_of(view_of("images/a.jpg", 0.1, mask), view_of("b", -0.5)))
+    got = written(tmp_path, view_of("images/a.jpg", 0.1, mask), view_of("b", -0.5))
     assert [v["picture"] for v in got["metrics"]["views"]] == ["comparison/images_a.png", "comparison/b.png"]
 
     with Image.open(tmp_path / "comparison" / "images_a.png") as file:
@@ -154,7 +156,7 @@ def test_hostile_view_names_stay_in_the_folder(tmp_path: Path) -> None:
         "report.json",
     ]
     out = tmp_path / "deep" / "er" / "out"
-    got = write_report(out, result_of(*(view_of(name) for name in names)))
+    got = written(out, *(view_of(name) for name in names))
     files = tree(tmp_path)
     pictures = [f"deep/er/out/{v['picture']}" for v in got["metrics"]["views"]]
     assert len({p.lower() for p in pictures}) == len(names)
@@ -173,7 +175,7 @@ def test_hostile_view_names_stay_in_the_folder(tmp_path: Path) -> None:
 def test_failure_midway_leaves_the_old_report_and_no_scraps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
 ) -> None:
-    write_report(tmp_path, result_of(view_of("a"), view_of("b")))
+    written(tmp_path, view_of("a"), view_of("b"))
     before = tree(tmp_path)
 
     calls = 0
@@ -188,7 +190,7 @@ def test_failure_midway_leaves_the_old_report_and_no_scraps(
 
     monkeypatch.setattr(report, broken, fails)
     with pytest.raises(OSError, match="No space left"):
-        write_report(tmp_path, result_of(view_of("a", 0.2), view_of("b", 0.2), seed=8))
+        written(tmp_path, view_of("a", 0.2), view_of("b", 0.2), seed=8)
     assert calls
     assert tree(tmp_path) == before
     assert not list(tmp_path.glob(".report.*"))
@@ -196,14 +198,14 @@ def test_failure_midway_leaves_the_old_report_and_no_scraps(
     (tmp_path / ".report.killed").mkdir()  # what a killed process leaves goes with the next report
     (tmp_path / ".report.killed.html").write_text("<html>")
     monkeypatch.undo()
-    write_report(tmp_path, result_of(view_of("a", 0.2), seed=9))
+    written(tmp_path, view_of("a", 0.2), seed=9)
     assert not list(tmp_path.glob(".report.*"))
 
 
 def test_report_json_is_there_only_with_everything_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_report(tmp_path, result_of(view_of("a")))
+    written(tmp_path, view_of("a"))
     moved: list[str] = []
     replace = Path.replace
 
@@ -214,7 +216,7 @@ def test_report_json_is_there_only_with_everything_else(
         return replace(self, target)
 
     monkeypatch.setattr(Path, "replace", recording)
-    write_report(tmp_path, result_of(view_of("a"), view_of("b")))
+    written(tmp_path, view_of("a"), view_of("b"))
     assert moved == ["comparison/a.png", "comparison/b.png", "report.json"]
 
 
@@ -230,7 +232,7 @@ def test_a_field_that_is_no_json_is_named_before_work_starts(
     tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        write_report(tmp_path / "out", result_of(view_of("a"), **changes))
+        written(tmp_path / "out", view_of("a"), **changes)
     assert not (tmp_path / "out").exists()
 
 
@@ -260,12 +262,11 @@ def test_each_view_is_rendered_once_and_few_are_held() -> None:
 def test_a_bad_view_is_named(tmp_path: Path) -> None:
     bad = RenderedView("b.jpg", np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.float32))
     with pytest.raises(ValueError, match=r"view 'b.jpg': render has shape \[4, 5, 3\]"):
-        write_report(tmp_path / "out", result_of(view_of("a"), bad))
-    assert not (tmp_path / "out").exists()
+        written(tmp_path, view_of("a"), bad)
 
 
 def test_scene_without_held_out_views_gets_a_report(tmp_path: Path) -> None:
-    got = write_report(tmp_path, result_of())
+    got = written(tmp_path)
     assert got["metrics"]["mean"] == dict.fromkeys(METRICS)
     assert got["metrics"]["reasons"] == dict.fromkeys(METRICS, "there is no held-out photo")
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TypedDict
 
 AT_ONCE = 1 << 20  # values of a kind that are made on the way together, so that memory is bounded
-PACKAGES = ("hqgs", "torch", "numpy", "pycolmap", "piq", "lpips", "pillow", "matplotlib")
 
 
 class MachineFacts(TypedDict):
@@ -47,7 +46,7 @@ def version_facts() -> dict[str, str | None]:
     files differ from it; None for an installed copy.
     """
     facts: dict[str, str | None] = {"python": platform.python_version()}
-    for package in PACKAGES:
+    for package in ("hqgs", "torch", "numpy", "pycolmap", "piq", "lpips", "pillow", "matplotlib"):
         try:
             facts[package] = metadata.version(package)
         except metadata.PackageNotFoundError:

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from hqgs.scene.scene import Scene
     from hqgs.show.export import Export
 
-OF_FILES = ("sh_degree", "sh_bits", "spz_version", "band_tolerance")  # options that say how a file is written
-
 
 @dataclass(frozen=True, kw_only=True)
 class ExportScene:
@@ -59,7 +57,8 @@ OPTIONS = ExportScene
 
 def run(args: ExportScene) -> int:
     """Export what `args` say and print tables; return the exit code (0 done, 1 failed, 2 bad input)."""
-    said = {name: value for name in OF_FILES if (value := getattr(args, name)) is not None}
+    of_files = ("sh_degree", "sh_bits", "spz_version", "band_tolerance")  # how a file is written
+    said = {name: value for name in of_files if (value := getattr(args, name)) is not None}
     options = ExportOptions(format_of(args.out, args.format, written=True), **said)
     _check_together(args, options.format)
     source = scene_file(args.source)

@@ -32,17 +32,15 @@ WORDS = {  # tyro's, and ours
     r"Error parsing (\S+):(?= is )": r"\1",
     r"Error parsing \S+: ": "",
 }
-GPU = ("--device", "--cuda", "--gpu", "--gpus")
-OF_3DGS = ("-s", "--source_path", "-m", "--model_path")
 POINT = re.compile(r"-[\d.]+(?:e-?\d+)?,")  # one whose first coordinate is negative
 HOME = re.compile(r"^(--[\w-]+=)?(~(?:/.*)?)$", re.DOTALL)  # which the shell leaves as it is after =
 
 
 def parse(options: type[T], command: str, about: str, arguments: Sequence[str]) -> T:
     """The options that the arguments give. Help and mistakes end the program, mistakes with one sentence."""
-    if asked := [a for a in arguments if a.split("=")[0] in GPU]:
+    if asked := [a for a in arguments if a.split("=")[0] in ("--device", "--cuda", "--gpu", "--gpus")]:
         raise SystemExit(fail(2, f"there is no {asked[0]}: hqgs runs on the CPU; leave this option out"))
-    if asked := [a for a in arguments if a in OF_3DGS]:
+    if asked := [a for a in arguments if a in ("-s", "--source_path", "-m", "--model_path")]:
         raise SystemExit(fail(2, f"there is no {asked[0]}: write hqgs train PHOTOS --out RUN"))
     arguments = [f" {a}" if POINT.match(a) else a for a in arguments]  # else -1,2,3 would be an option
     arguments = [HOME.sub(lambda m: (m[1] or "") + os.path.expanduser(m[2]), a) for a in arguments]

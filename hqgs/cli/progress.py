@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from hqgs.base.stages import Stage
     from hqgs.training.progress import Progress
 
-_NUMBERS_EVERY = 10  # steps between updates of the bar
-_SILENT = 5.0  # s without a line before a run trains, where there is no terminal
-_TOLD_EVERY = 60.0  # s between lines of the training without a terminal
 _MEASURED, _SOON = 35, 5.0  # steps, or s of them, after which the time that is left is told
 Self = TypeVar("Self", bound="Screen")
 
@@ -63,7 +60,7 @@ class Screen:
             return
         left = self._left(stage)
         self.show(stage.what, stage.done, stage.total, left)
-        if not self.live and time.perf_counter() - self._said > _SILENT:
+        if not self.live and time.perf_counter() - self._said > 5:  # s without a line
             count = f": {stage.done}" if stage.done else ""
             count += f" of {stage.total}" if count and stage.total else ""
             self.say(f"{stage.what}{count}{left and f', {left}'}")
@@ -125,10 +122,10 @@ class TrainingScreen(Screen):
             psnr = now.evaluated["psnr"]
             self._held_out = "no PSNR" if psnr is None else f"{psnr:.2f} dB"
             self.say(_evaluated(now) + _left(now))
-        elif not self.live and self.ended - self._said > _TOLD_EVERY:
+        elif not self.live and self.ended - self._said > 60:  # s without a line
             numbers = f"{now.gaussians} Gaussians, {now.seconds:.0f} s, loss {now.loss:.3f}"
             self.say(f"iteration {now.iteration} of {now.length}: {numbers}{_left(now)}")
-        if now.iteration % _NUMBERS_EVERY == 0 or now.evaluated is not None:
+        if now.iteration % 10 == 0 or now.evaluated is not None:
             more = f"held-out {self._held_out}, {now.gaussians:,} Gaussians, loss {now.loss:.3f}"
             self.show("training", now.iteration, now.length, _left(now).removeprefix("; "), more)
         before, self._steps = self._steps, self._steps + 1

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from hqgs.show.trust import Trust
 
 PATHS = ("cameras", "orbit")
-FRAMES = 240
 PICTURE = re.compile(r"\d{5}\.png|\d{3}_.*\.png")  # as they are named in a folder
 
 
@@ -141,7 +140,7 @@ def _cameras(
 
     source, views, path, frames = options.source, options.views, options.path or PATHS[0], options.frames
     known = gaussians.along(run.cameras)
-    count = given(frames, FRAMES)
+    count = given(frames, 240)
     if views is not None:
         if known is None:
             raise ValueError(f"{source} has no cameras.json, so its views are unknown: use --path orbit")

@@ -25,11 +25,7 @@ from hqgs.scene.geometry import project, within
 from hqgs.scene.scene import Camera, View
 
 Floats = NDArray[np.float64]
-# Levenberg's steps: cameras turned by 1.5 degrees come home (`tests/test_fit_cameras.py`).
-SMOOTHED = (3.0, 1.0, 0.0)  # px; coarse to fine, so that a camera may be several pixels off
-FIT_STEPS = 10  # at each of them, at most
 DIFFERENCE = 0.3  # px by which a camera is moved to see what that changes
-SETTLED = 1e-4  # of the squared error; less gained ends a level
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,7 @@ def fit_camera(
         return image.clamp(0, 1).numpy().astype(np.float64)
 
     camera = view.camera
-    for sigma in SMOOTHED:
+    for sigma in (3.0, 1.0, 0.0):  # px, coarse to fine: a camera may be several pixels off
         camera = _level(camera, seen, photo, counted, units, sigma)
     if _cost(seen(camera), photo, counted, 0.0) >= _cost(seen(view.camera), photo, counted, 0.0):
         camera = view.camera
@@ -134,5 +130,6 @@ def _level(
         here = off(move)
         return np.stack([(off(move + one) - here) / DIFFERENCE for one in DIFFERENCE * np.eye(6)], axis=1)
 
-    found = least_squares(off, np.zeros(6), slopes, ftol=SETTLED, max_nfev=FIT_STEPS)  # pyright: ignore[reportArgumentType]
+    # Cameras turned by 1.5 degrees come home in so many steps (`tests/test_fit_cameras.py`).
+    found = least_squares(off, np.zeros(6), slopes, ftol=1e-4, max_nfev=10)  # pyright: ignore[reportArgumentType]
     return _moved(camera, found.x * units)

@@ -7,8 +7,6 @@ import re
 import shutil
 import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import cast
 
@@ -27,65 +25,38 @@ from hqgs.photos.sheet import printable, sheet
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
 
 
-@dataclass(frozen=True)
-class RunResult:
-    """What a training run hands to `write_report`."""
-
-    record: RunRecord
-    views: Sequence[RenderedView]
-
-
-def measure(result: RunResult) -> Report:
-    """The report, with the held-out views measured; it names no pictures yet.
-
-    Raises ValueError where a field is no JSON value, or a view's render, photo and mask do not fit.
-    """
-    _check(result.record)  # before work starts
-    return _report(result, measured(result.views), None)
-
-
-def write_report(out_dir: str | Path, result: RunResult) -> Report:
-    """Measure the held-out views and write the report into `out_dir`; return what report.json holds.
+def write_report(out: Path | None, record: RunRecord, views: Sequence[RenderedView]) -> Report:
+    """Measure the held-out views and write the report into the folder `out`; what report.json holds.
 
     Files: `comparison/<view>.png` (photo | render | amplified difference) and `report.json`, which names
     them. They are made beside their places and then moved there; report.json is moved last, so where it
     exists everything else does. A run that fails before the move leaves an older report as it was. Pictures
-    of other view names are not removed.
+    of other view names are not removed. `out` None: nothing is written, and no picture is named.
 
-    Raises ValueError as `measure` does, OSError where a file cannot be written.
+    Raises ValueError where a field is no JSON value, or a view's render, photo and mask do not fit, OSError
+    where a file cannot be written.
     """
-    out_dir = Path(out_dir)
-    _check(result.record)  # before work starts
-    made = not out_dir.exists()
-    out_dir.mkdir(parents=True, exist_ok=True)
-    try:
-        return _written(out_dir, result)
-    except BaseException:
-        if made:
-            with suppress(OSError):  # it is not empty
-                out_dir.rmdir()
-        raise
-
-
-def _written(out_dir: Path, result: RunResult) -> Report:
-    """`write_report` into a folder that is there."""
-    files = _file_names(names_of(result.views))
-    for leftover in out_dir.glob(".report.*"):  # of a run that was killed
+    _check(record)  # before work starts
+    if out is None:
+        return _report(record, names_of(views), measured(views), [None] * len(views))
+    pictures = [f"{PICTURES}/{file}" for file in _file_names(names_of(views))]
+    out.mkdir(parents=True, exist_ok=True)
+    for leftover in out.glob(".report.*"):  # of a run that was killed
         shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()  # a page is a file
-    with tempfile.TemporaryDirectory(dir=out_dir, prefix=".report.") as name:
+    with tempfile.TemporaryDirectory(dir=out, prefix=".report.") as name:
         stage = Path(name)
         (stage / PICTURES).mkdir()
 
         def draw(number: int, view: RenderedView, metrics: ViewMetrics) -> None:
-            comparison_picture(view, metrics).save(stage / PICTURES / files[number], compress_level=2)
+            comparison_picture(view, metrics).save(stage / pictures[number], compress_level=2)
 
-        report = _report(result, measured(result.views, draw), files)
+        report = _report(record, names_of(views), measured(views, draw), pictures)
         write_json(stage / REPORT, report)
 
-        (out_dir / PICTURES).mkdir(exist_ok=True)
-        (out_dir / REPORT).unlink(missing_ok=True)  # from here on the old report has lost its pictures
-        for file in (*(f"{PICTURES}/{file}" for file in files), REPORT):
-            (stage / file).replace(out_dir / file)
+        (out / PICTURES).mkdir(exist_ok=True)
+        (out / REPORT).unlink(missing_ok=True)  # from here on the old report has lost its pictures
+        for file in (*pictures, REPORT):
+            (stage / file).replace(out / file)
     return report
 
 
@@ -108,24 +79,25 @@ def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
     return sheet([list(zip(captions, panels, strict=True))])
 
 
-def _report(result: RunResult, metrics: list[ViewMetrics], files: list[str] | None) -> Report:
-    """The report of measured views; `files`: the names of their pictures."""
+def _report(
+    record: RunRecord, names: Sequence[str], metrics: list[ViewMetrics], pictures: Sequence[str | None]
+) -> Report:
+    """The report of measured views."""
     mean = mean_metrics(metrics)
-    pictures = [None] * len(metrics) if files is None else [f"{PICTURES}/{file}" for file in files]
     measured: MetricsRecord = {
         "mean": _values(mean),
         "interval": cast(MetricValues, half_widths([vars(m) for m in metrics], METRICS)),
         "confidence": CONFIDENCE,
         "views": [
             {"name": name, **_values(m), "picture": picture}
-            for name, m, picture in zip(names_of(result.views), metrics, pictures, strict=True)
+            for name, m, picture in zip(names, metrics, pictures, strict=True)
         ],
         "reasons": mean.reasons,
     }
-    for record, of in zip((measured, *measured["views"]), (mean, *metrics), strict=True):
+    for values, of in zip((measured, *measured["views"]), (mean, *metrics), strict=True):
         if of.psnr_shown is not None:
-            record["psnr_shown"] = of.psnr_shown
-    return {"metrics": measured, **result.record, "machine": machine_facts(), "versions": version_facts()}
+            values["psnr_shown"] = of.psnr_shown
+    return {"metrics": measured, **record, "machine": machine_facts(), "versions": version_facts()}
 
 
 def _check(record: RunRecord) -> None:
@@ -138,8 +110,7 @@ def _check(record: RunRecord) -> None:
 
 
 def _values(metrics: ViewMetrics) -> MetricValues:
-    values = asdict(metrics)
-    return cast(MetricValues, {metric: values[metric] for metric in METRICS})
+    return cast(MetricValues, {metric: getattr(metrics, metric) for metric in METRICS})
 
 
 def _file_names(views: list[str]) -> list[str]:

@@ -117,7 +117,6 @@ def pixel_map(first: Camera, second: Camera) -> Floats:
 
 
 WIDENED = 1.6  # what widens a range of depths between points around a pixel
-LEAST_AROUND = 3  # points that a view needs
 ALONE = 0.8  # the correlation that one photo alone must have
 STAGE = "first points, from photos"
 
@@ -225,7 +224,7 @@ class Surfaces:
 
     def known(self, number: int) -> bool:
         """Whether enough is known of a view to tell ranges."""
-        return len(self._depths[number]) >= LEAST_AROUND
+        return len(self._depths[number]) >= 3
 
     def add(self, number: int, pixels: Floats, depths: Floats) -> None:
         """More pixels [M, 2] of a view, and their depths [M]."""

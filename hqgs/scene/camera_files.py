@@ -22,8 +22,6 @@ from hqgs.scene.paths import scene_up, view_matrix
 from hqgs.scene.scene import Camera, Scene
 from hqgs.scene.world import World
 
-MOST_FRAMES = 100_000  # of a camera path in a file
-
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes (y up, z back) to OpenCV's
 
 
@@ -267,7 +265,7 @@ def load_path(path: str | Path) -> tuple[list[Camera], float]:
         for one in (value, *frames):
             if (kind := one.get("camera_type", "perspective")) != "perspective":
                 raise ValueError(f"camera_type is {kind!r}, only perspective cameras can be rendered")
-        if not 0 < len(frames) <= MOST_FRAMES:
+        if not 0 < len(frames) <= 100_000:
             raise ValueError(f"{len(frames)} frames")
         if not 0 < fps <= 1000:
             raise ValueError(f"fps is {fps}")

@@ -22,10 +22,6 @@ from hqgs.scene.formats.colmap import write_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, write_degraded_folder
 from hqgs.scene.scene import Scene, View
 
-SOME_FACTORS = (0.5, 1.5)  # of a `some` step's value: the least and the most
-
-_CHOICE = 1  # third word of the choice's seed; a photo's own generator has two
-
 
 def degrade_scene(scene: Scene, degradation: Degradation, seed: int) -> Scene:
     """The scene with degraded training photos (float32, `View.low` with low-res); held-out ones as they are.
@@ -148,9 +144,9 @@ def degraded_views(scene: Scene, degradation: Degradation, seed: int) -> Iterato
 def _factors(scene: Scene, seed: int) -> dict[str, float]:
     """The half of the training photos that `some` steps hit, each with its factor."""
     names = sorted(view.name for view in (*scene.train, *scene.test))
-    rng = np.random.default_rng([seed, 0, _CHOICE])
+    rng = np.random.default_rng([seed, 0, 1])  # a photo's own generator has two words
     places = dict(zip(names, rng.random(len(names)), strict=True))
-    factors = dict(zip(names, rng.uniform(*SOME_FACTORS, len(names)).tolist(), strict=True))
+    factors = dict(zip(names, rng.uniform(0.5, 1.5, len(names)).tolist(), strict=True))
     train = sorted((view.name for view in scene.train), key=lambda name: places[name])
     return {name: factors[name] for name in train[: _half(len(train))]}
 

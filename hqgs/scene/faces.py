@@ -20,9 +20,7 @@ from hqgs.scene.constants import SHOWN, SMALLEST_SIDE
 
 WIDE = 120.0  # degrees across or up and down that a flat picture shows at most
 FACE_LATTICE = 128  # rays each way that tell which part of a face a photo shows
-FACE_SPAN = 0.1  # of a face's side that what it shows must span: a strip would have no pixels when scaled
 THETAS = 1024  # angles at which a lens is asked whether its picture still grows
-DARK = 12  # of 255: corners outside of the circle that a fisheye throws
 
 AROUND = "EQUIRECTANGULAR"  # COLMAP's model of photos of 360 x 180 degrees
 # rotations, face from camera: x, y and z of each face in the camera's frame (x right, y down, z forward)
@@ -103,7 +101,8 @@ def _faces(model: str, params: tuple[float, ...], width: int, height: int, finer
         if shown.mean() < SHOWN:
             continue
         (left, right), (top, bottom) = (_span(shown, axis, side) for axis in (0, 1))
-        if min(right - left, bottom - top) < max(SMALLEST_SIDE, FACE_SPAN * side):
+        # A strip would have no pixels when it is scaled.
+        if min(right - left, bottom - top) < max(SMALLEST_SIDE, 0.1 * side):
             continue
         K = np.array([[focal, 0, side / 2 - left], [0, focal, side / 2 - top], [0, 0, 1]])
         found.append(Face(name, rotation, right - left, bottom - top, K, limit))
@@ -148,6 +147,6 @@ def _sees(camera: pycolmap.Camera) -> tuple[float, float]:
 def lit(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Where [H, W] light fell: not the dark corners around the circle that a fisheye throws."""
     parts = np.empty(image.shape[:2], np.int32)
-    label(image.max(-1) < DARK, output=parts)
+    label(image.max(-1) < 12, output=parts)  # of 255
     corners = parts[[0, 0, -1, -1], [0, -1, 0, -1]]
     return ~np.isin(parts, corners[corners > 0]) if corners.all() else np.ones(parts.shape, bool)

@@ -15,8 +15,6 @@ from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.run import key_of
 from hqgs.scene.sfm.triangulated import SparsePoints, triangulated
 
-TOO_SMALL = 100  # px of the photos, below which COLMAP finds no points
-
 
 def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent) -> Scene:
     """The scene with points of its training photos, and which photo sees which, in place of random ones.
@@ -27,7 +25,7 @@ def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = sile
     views = scene.train
     sides = [min(view.camera.width, view.camera.height) for view in views]
     own = not scene.guessed and len(scene.points) >= FEWEST
-    if own or len(views) < 2 or min(sides) < TOO_SMALL:
+    if own or len(views) < 2 or min(sides) < 100:  # COLMAP finds none in smaller ones
         return scene
     on_stage(Stage("COLMAP: points for the given cameras", 0, 0))
     file = None if keep is None else keep / f"points-{key_of('points', _pieces(scene))}.npz"

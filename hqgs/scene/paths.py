@@ -13,9 +13,7 @@ from hqgs.base.evenly import evenly
 from hqgs.scene.constants import PATH_FOV, PATH_SIZE
 from hqgs.scene.scene import Camera, Scene
 
-MOST_WALKED, MOST_KEYS = 400, 24  # cameras that are put in order; that a path goes through: more shake it
 LEAP = 10.0  # median steps: south 26, from one side of a house to another; films and walks around up to 7
-TURN_EXTENT = 0.5  # of the cameras' extent: the way that counts as much as a turn of one radian
 
 UP = (0.0, -1.0, 0.0)  # of a scene that says nothing: COLMAP's first camera has y down
 AROUND = math.radians(150)  # cameras that see their focus from a wider range are walked around in a circle
@@ -153,7 +151,8 @@ def camera_path(
     ends = [0, *(int(end) for end in np.rint(frames * np.cumsum(shares)))]
     viewmats: list[_Array] = []
     for piece, share, (begin, end) in zip(pieces, shares, pairwise(ends), strict=True):
-        keys = [piece[k] for k in evenly(len(piece), max(2, round(MOST_KEYS * share)))] if sort else piece
+        # Of many more cameras a path shakes.
+        keys = [piece[k] for k in evenly(len(piece), max(2, round(24 * share)))] if sort else piece
         viewmats += _spline(keys, end - begin, closed) if end > begin else []
     first = cameras[0]
     return [Camera(first.width, first.height, first.K, viewmat) for viewmat in viewmats]
@@ -275,7 +274,7 @@ def _range(flat: _Array, up: _Array) -> float:
 
 def _walk(cameras: list[Camera]) -> list[Camera]:
     """The cameras in the order of a walk; of very many, every so manieth."""
-    own = [cameras[k] for k in evenly(len(cameras), MOST_WALKED)]
+    own = [cameras[k] for k in evenly(len(cameras), 400)]
     tour = [own[k] for k in _short_walk(np.stack([camera.center for camera in own]))]
     return own if _lengths(own).sum() <= 1.5 * _lengths(tour).sum() else tour
 
@@ -324,7 +323,7 @@ def _steps(centers: _Array, R: _Array) -> _Array:
     extent = float(np.linalg.norm(centers - centers.mean(0), axis=1).max()) or 1.0
     cosines = (np.einsum("nij,nij->n", R[1:], R[:-1]) - 1) / 2
     turns = np.arccos(cosines.clip(-1, 1))
-    return np.hypot(np.linalg.norm(np.diff(centers, axis=0), axis=1), TURN_EXTENT * extent * turns)
+    return np.hypot(np.linalg.norm(np.diff(centers, axis=0), axis=1), 0.5 * extent * turns)
 
 
 def _check(cameras: Sequence[Camera], frames: int) -> None:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from hqgs.scene.constants import OUTLIER, ROUNDING
 
-ORIENTATIONS = 0.1  # weight of cameras' orientations beside their centres; decides where those are in line
 HYPOTHESES = 100  # choices of two or three that are tried: enough where half of all are wrong
 
 Array = NDArray[np.float64]
@@ -38,7 +37,7 @@ def similarity(source: Array, target: Array, turns: Array | None = None) -> tupl
     own = np.linalg.svd(a, compute_uv=False)
     if turns is None and not own[1] > 1e-3 * own[0]:
         return None
-    told = 0.0 if turns is None else ORIENTATIONS * turns.mean(0)
+    told = 0.0 if turns is None else 0.1 * turns.mean(0)  # decides where the points are in line
     U, _, Vt = np.linalg.svd(b.T @ a / math.prod(lengths) + told)
     R = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt)) or 1]) @ Vt
     scale = float((b * (a @ R.T)).sum()) / lengths[0] ** 2

@@ -26,17 +26,11 @@ from hqgs.scene.scene import Scene, View
 # Tried on the room and on 13 captures of others.
 UP_CONE = 15.0  # degrees from how the photos were held, at most
 UP_SURE = 1.0  # degrees: a wider 95 % interval is no answer
-UP_PHOTOS = 24  # spread over the scene
-EDGE_STEP = 0.01  # of white, for each px
 EDGE_LENGTH, EDGE_WIDTH = 0.04, 5.0  # of a photo's longer side, least; px, most
 EDGE_OFF = 0.7  # degrees, sigma, that an upright edge may be off
 EDGES_FEWEST, EDGES_SHARE = 20, 0.3  # upright ones; their share of the length of those within UP_CONE
-EDGES_CLEAR = 2.5  # times what meets in the directions around
 
 Floats = NDArray[np.float64]
-_DRAWS = 100  # of photos, to see how far the answer moves
-_LEAN = 0.5  # degrees that walls and furniture are off themselves; 40 draws of photos of the room
-_LEAST = 3  # photos with upright edges
 _NEAR = math.cos(math.radians(UP_CONE))
 
 
@@ -91,7 +85,7 @@ def _told(scene: Scene, up: Floats, why: str) -> Scene:
 
 def by_edges(views: Sequence[View], before: Floats) -> Up | None:
     """Up within UP_CONE of `before`, by edges of photos that stand upright; None: too few agree on one."""
-    chosen = [views[k] for k in evenly(len(views), UP_PHOTOS)]
+    chosen = [views[k] for k in evenly(len(views), 24)]
     edges = [_edges(view, before) for view in chosen]
     photo = np.repeat(np.arange(len(edges)), [len(rows) for rows in edges])
     planes, weights = np.concatenate(edges)[:, :3], np.concatenate(edges)[:, 3]
@@ -105,12 +99,14 @@ def by_edges(views: Sequence[View], before: Floats) -> Up | None:
     upright = np.abs(_along(planes, up)) < math.sin(math.radians(1.5 * EDGE_OFF))
     share, photos = float(weights[upright].sum() / weights.sum()), len(np.unique(photo[upright]))
     rng = np.random.default_rng(0)
-    drawn = rng.integers(0, len(edges), (_DRAWS, len(edges)))
+    drawn = rng.integers(0, len(edges), (100, len(edges)))  # of photos, to see how far the answer moves
     counts = [np.bincount(rows, minlength=len(edges))[photo] for rows in drawn]
     others = np.array([_meeting(planes, weights * count, up) for count in counts])
-    error = math.hypot(float(np.quantile(_degrees(others, up), 0.95)), _LEAN)
-    told = share > EDGES_SHARE and upright.sum() >= EDGES_FEWEST and scores.max() > EDGES_CLEAR * beside
-    if not told or photos < _LEAST or error > UP_SURE or up @ before < _NEAR:
+    lean = 0.5  # degrees that walls and furniture are off themselves; 40 draws of photos of the room
+    error = math.hypot(float(np.quantile(_degrees(others, up), 0.95)), lean)
+    # `beside`: what meets in the directions around.
+    told = share > EDGES_SHARE and upright.sum() >= EDGES_FEWEST and scores.max() > 2.5 * beside
+    if not told or photos < 3 or error > UP_SURE or up @ before < _NEAR:
         return None
     return Up(up, error, f"{upright.sum()} upright edges in {photos} photos")
 
@@ -129,7 +125,7 @@ def _edges(view: View, up: Floats) -> Floats:
     view = shrunk(view, COPY_SIDE)
     grey = as_floats(view.image).mean(2)
     across, down = np.gradient(gaussian_filter(grey, 1.0))[::-1]
-    steep = np.hypot(across, down) > EDGE_STEP
+    steep = np.hypot(across, down) > 0.01  # of white, for each px
     rows, columns = np.nonzero(steep if view.mask is None else steep & view.mask)
     gx, gy = (value[rows, columns].astype(np.float64) for value in (across, down))
     middle = view.camera.K[:2, 2]

@@ -40,10 +40,7 @@ LATTICE, EXACT = 8, 0.02
 # Pixels of the photo between samples: where they are farther apart, means come first; and at which it may be
 # decoded: 6000 px go to 1600 by way of 3000.
 FAR_SAMPLES, DENSE_SAMPLES = 1.25, 1.75
-FILM_SHRUNK = 1.5  # times: until then a smaller frame shows as much of the film's codec as at its own size
-GIVEN_BACK = 10  # photos, after which freed memory is given back
 
-_CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
 _CameraKey = tuple[str, tuple[float, ...], int, int, int, int, str]
 
 
@@ -73,7 +70,8 @@ def load_views(
 
     keep_large_arrays_apart()
 
-    @lru_cache(maxsize=len(CUBE) if any(photo.face for photo in photos) else _CAMERAS_KEPT)
+    # Kept for the next photos of the same camera; a grid takes 8 bytes a pixel.
+    @lru_cache(maxsize=len(CUBE) if any(photo.face for photo in photos) else 2)
     def made(key: _CameraKey) -> Pinhole:
         model, params, camera_width, camera_height, width, height, name = key
         camera = pycolmap.Camera(model=model, params=params, width=camera_width, height=camera_height)
@@ -109,7 +107,7 @@ def load_views(
                 views += job.result()
                 done += len(faces)
                 on_stage(Stage("photos read", done, len(photos)))
-                if (k + 1) % GIVEN_BACK == 0 or done == len(photos):
+                if (k + 1) % 10 == 0 or done == len(photos):
                     give_back_memory()
         finally:
             pool.shutdown(cancel_futures=True)  # after an error the photos still waiting are not wanted
@@ -196,7 +194,8 @@ def _view(
     if mask is not None and mask.all():
         mask = None
     camera_now = Camera(width, height, K, photo.viewmat)
-    film = photo.film if downscale <= FILM_SHRUNK else None
+    # Until then a smaller frame shows as much of the film's codec as at its own size.
+    film = photo.film if downscale <= 1.5 else None
     image, empty = parts_of(image) if cut_out else (image, None)
     return View(photo.name, camera_now, image, mask, None, decoded.turns, film, decoded.device, face, empty)
 

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from hqgs.scene.constants import GREATEST, ONE_PLACE, SMALLEST, USUAL
 from hqgs.scene.georeference import Georeference
 
-FAR_ORIGIN = 16.0  # sizes from the origin: from here on it is moved, before float32 is 1e-3 of 1,000 px off
-
 Array = NDArray[np.floating[Any]]
 
 
@@ -138,7 +136,7 @@ def world_for(centers: Array, points: Array) -> World:
     if not ONE_PLACE * float(np.abs(middle).max()) < size < math.inf:
         return World()
     shift = (0.0, 0.0, 0.0)
-    if np.abs(middle).max() > FAR_ORIGIN * size:
+    if np.abs(middle).max() > 16 * size:  # before float32 is 1e-3 of 1,000 px off
         step = 10.0 ** math.ceil(math.log10(size))
         x, y, z = (round(float(value) / step) * step for value in middle)
         shift = (x, y, z)

@@ -35,8 +35,6 @@ SHOWN = ("color", "depth", "alpha", "trust")
 FILMS = (".mp4", ".gif")
 _BT709 = 1  # its matrix, primaries and transfer in H.273; as FFmpeg's range: that of video
 _EXACT = 0x4 | 0x2000 | 0x40000  # SWS_BICUBIC, SWS_FULL_CHR_H_INT, SWS_ACCURATE_RND
-CRF = "18"  # of x264: no difference that an eye finds
-OTHERS = (*FILM_SUFFIXES, *PHOTO_SUFFIXES)  # names of files that are not written
 Picture = NDArray[np.uint8]
 OnFrame = Callable[[int, int], None]
 
@@ -124,7 +122,9 @@ def check_frames(cameras: Sequence[Camera], out: Path, fps: float, show: str) ->
     if suffix in (*FILMS, ".png"):
         if out.is_dir():
             raise ValueError(f"{out} is a folder: name a file, or a folder without {suffix}")
-    elif (suffix[1:].isalpha() or suffix in OTHERS or out.exists()) and not out.is_dir():
+    elif (
+        suffix[1:].isalpha() or suffix in (*FILM_SUFFIXES, *PHOTO_SUFFIXES) or out.exists()
+    ) and not out.is_dir():
         raise ValueError(f"{out} is not a folder; films are .mp4 or .gif, a single picture is .png")
 
 
@@ -271,7 +271,7 @@ def _write_mp4(av: Any, path: Path, pictures: Iterator[Picture], fps: float) -> 
     with av.open(str(path.absolute()), "w", options={"movflags": "+faststart"}) as film:
         stream = film.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": CRF, "preset": "veryfast"}
+        stream.options = {"crf": "18", "preset": "veryfast"}  # no difference that an eye finds
         # Players take films without tags for BT.601 or BT.709, by their size.
         coded = stream.codec_context
         coded.colorspace = coded.color_primaries = coded.color_trc = coded.color_range = _BT709

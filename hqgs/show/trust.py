@@ -28,13 +28,11 @@ from hqgs.scene.scene import Camera
 
 WORST_SHOWN = 64.0  # levels of 255, of the brightest or reddest pixel of a map of errors
 PHOTOS, SIDE = 64, 400  # training photos that are looked at, at most; px, of their longer side
-ROUNDS = 4  # of the maximisation: more change the order of the pixels by less than its scatter
 PRIOR = 0.1  # error of a Gaussian (white is 1), as of one pixel's weight
 EMPTY = 0.3  # error of what is behind everything
 FLOOR = 0.002  # keeps ratios of errors finite: half a level
 POWER, SCALE = 0.70, 0.52  # from what is carried to what SHARE of new pixels stay below: of three scenes
 SHARE = 0.9  # of the pixels: what a bound promises
-CALIBRATORS = 40  # held-out photos that calibrate, at most
 Array = NDArray[np.float32]
 
 
@@ -130,7 +128,7 @@ def trust_of(gaussians: Gaussians, known: RunCameras | None) -> Trust:
 def learn_trust(gaussians: Gaussians, known: RunCameras) -> Trust:
     """What the photos of a run, in its folder, say of its Gaussians.
 
-    The errors are those of at most PHOTOS training photos, the factor is that of CALIBRATORS others.
+    The errors are those of at most PHOTOS training photos, the factor is that of up to 40 others.
     ValueError where the run has no training photo.
     """
     views = [view for view in known.views if not view.held_out and shows(view)]
@@ -145,13 +143,13 @@ def learn_trust(gaussians: Gaussians, known: RunCameras) -> Trust:
             sums += _back(gaussians, off.camera, torch.zeros(n, 2), pixels)
         weights = sums[:, 0] + 1
         errors = (sums[:, 1] + PRIOR) / weights
-        for _ in range(ROUNDS):
+        for _ in range(4):  # more change the order of the pixels by less than its scatter
             found = torch.zeros(n)
             for off in looks:
                 found += _back(gaussians, off.camera, errors[:, None], off.error[..., None], off.counts)[:, 0]
             errors = (errors * found + PRIOR) / weights
     out, held = [view for view in known.views if view.held_out and shows(view)], list[Held]()
-    for view in (out[k] for k in evenly(len(out), CALIBRATORS)):
+    for view in (out[k] for k in evenly(len(out), 40)):
         off = error_of(gaussians, view, known.background)
         if off.counts.any():
             seen = blended(gaussians, off.camera, errors)

@@ -17,7 +17,6 @@ from hqgs import _rust
 from hqgs.model.gaussians import Gaussians
 
 # A loaded state dict may ask for these.
-UNSUPPORTED = ("weight_decay", "amsgrad", "maximize", "differentiable")
 
 
 class Adam(torch.optim.Optimizer):
@@ -79,7 +78,8 @@ class Adam(torch.optim.Optimizer):
         writes, changed = list[tuple[Any, ...]](), list[Tensor]()
         steps = list[tuple[dict[str, Any], Tensor]]()
         for group in self.param_groups:
-            if asked := [name for name in UNSUPPORTED if group.get(name)]:
+            others = ("weight_decay", "amsgrad", "maximize", "differentiable")
+            if asked := [name for name in others if group.get(name)]:
                 raise ValueError(f"param_groups: {asked} of torch.optim.Adam cannot be had here")
             used = group.get("used")
             for param in group["params"]:

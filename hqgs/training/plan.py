@@ -124,14 +124,12 @@ def left_out_of(rows: Sequence[PlanRow]) -> list[LeftOut]:
     return [LeftOut(row.left_out, row.why, row.evidence or None) for row in rows if row.left_out is not None]
 
 
-ESSENTIAL = ("method", "formation", "loss", "budget", "first points", "length")
-WHERE_USED = ("opacity decay", "dropout of Gaussians")  # essential where they are
-
-
 def essential(plan: RunPlan) -> str:
     """The rows that a user should know of before the run, as lines."""
-    used = [row.what for row in plan.rows if row.what in WHERE_USED and row.value != "none"]
-    return plan_table([row for row in plan.rows if row.what in (*ESSENTIAL, *used)])
+    always = ("method", "formation", "loss", "budget", "first points", "length")
+    where_used = ("opacity decay", "dropout of Gaussians")
+    used = [row.what for row in plan.rows if row.what in where_used and row.value != "none"]
+    return plan_table([row for row in plan.rows if row.what in (*always, *used)])
 
 
 def plan_table(rows: Sequence[PlanRow]) -> str:

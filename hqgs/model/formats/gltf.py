@@ -46,10 +46,9 @@ if TYPE_CHECKING:
 NAME = "KHR_gaussian_splatting"
 ERROR = "_HQGS_ERROR"  # glTF keeps names that begin so for applications
 MAGIC, VERSION, JSON, BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
-FLOAT, POINTS = 5126, 0
+FLOAT = 5126
 INTEGERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2"}  # which stand for shares where normalized
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-DEEPEST, MOST = 100, 100_000  # nodes below each other, and in all
 # What is read of what a file may require: materials are not those of Gaussians.
 _KNOWN, _OF_MATERIALS = (NAME, "KHR_mesh_quantization"), ("KHR_materials_", "KHR_texture_")
 # What a primitive may say, the first where it says nothing. The order along the view and by distance differ
@@ -95,7 +94,7 @@ def write_gltf(path: Path, arrays: Arrays) -> int:
         binary.append(stored.tobytes())
         at += stored.nbytes
     primitive = {
-        "mode": POINTS,
+        "mode": 0,  # points
         "attributes": {name: k for k, name in enumerate(parts)},
         "extensions": {NAME: {name: allowed[0] for name, allowed in _SAYS.items()}},
     }
@@ -355,7 +354,7 @@ def _placed_meshes(content: Any) -> Iterator[tuple[int, Array]]:
     while waiting:
         number, above, depth = waiting.pop()
         visited += 1
-        if depth > DEEPEST or visited > MOST:
+        if depth > 100 or visited > 100_000:
             raise ValueError("its nodes do not form a tree")
         node = nodes[number]
         here = above @ _matrix(node)

@@ -89,8 +89,6 @@ def _kmeans(rows: Array, count: int) -> NDArray[np.int64]:
 
 
 META = "meta.json"
-MOST_BYTES = 1 << 30  # of a picture in its file
-MOST_GAUSSIANS = 50_000_000
 ACROSS = 64  # centroids of harmonics in a row of their picture
 LARGEST = 252  # the alpha of a rotation whose w is its largest component, left out
 _COEFFICIENTS = (0, 3, 8, 15)  # by bands
@@ -171,7 +169,7 @@ def read_sog(path: Path) -> Arrays:
 
             def member(name: str) -> bytes:
                 info = packed.getinfo(inside[name])
-                if info.file_size > MOST_BYTES:
+                if info.file_size > 1 << 30:  # bytes, of a picture
                     raise ValueError(f"{name} promises {info.file_size:,} bytes")
                 return packed.read(info)
 
@@ -188,7 +186,7 @@ def read_sog(path: Path) -> Arrays:
 def _read(file: Callable[[str], bytes]) -> Arrays:
     meta = json.loads(file(META))
     count = int(meta["count"] if "count" in meta else meta["means"]["shape"][0])
-    if not 0 < count <= MOST_GAUSSIANS:
+    if not 0 < count <= 50_000_000:
         raise ValueError(f"{count} Gaussians")
 
     def pixels(part: dict[str, Any], number: int = 0, rows: int | None = count) -> Bytes:

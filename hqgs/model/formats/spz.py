@@ -49,9 +49,6 @@ from hqgs.model.formats.arrays import (
 VERSIONS = (3, 4)  # that are written, first the one that more programs read; 2 is read too
 SH_BITS = (8, 8)  # of degree 1, of degrees 2 and 3; less rounds small values that many Gaussians share to 0
 
-LIMIT = (1 << 23) - 1  # of a 24-bit number; its negative is used alike
-FINE = 1 / 64  # the error of a position, as a share of its Gaussian's largest scale, that is fine enough
-COARSE = 1 / 8  # and the one that shows
 MISFIT_SHARE = 0.01  # of the Gaussians, whose positions or sizes the format may miss
 
 LOG_SCALE, LOG_OFFSET = 16.0, 10.0  # log scale = byte / 16 - 10
@@ -74,7 +71,6 @@ HEADER, HEADER_4, ENTRY = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12s
 MAX_GAUSSIANS = 10_000_000  # Niantic's reader takes no more
 MAX_FRACTION = 23  # bits after the point: a step of 1.2e-7, what float32 can tell apart at 1
 GZIP = 31  # zlib's number for a stream with a gzip header
-LEVEL = 19  # of zstd: the best that asks no more memory of a reader
 MAX_RATIO = {2: 1032, 3: 1032, 4: 1 << 15}  # deflate and zstd pack no better: 128 KiB of one byte take 4
 
 Array = NDArray[np.float64]
@@ -193,11 +189,11 @@ def _fraction(means: Array, scales: Array) -> int:
         )
     smallest = float(np.quantile(largest, MISFIT_SHARE, method="lower"))
     size = math.exp(min(max(smallest, -LOG_OFFSET), end))
-    fits = math.floor(math.log2(LIMIT / max(farthest, 0.5)))
-    needed = math.ceil(-math.log2(2 * FINE * size))
+    fits = math.floor(math.log2(((1 << 23) - 1) / max(farthest, 0.5)))  # of 24 bits, one is the sign
+    needed = math.ceil(-math.log2(size / 32))  # an error of 1/64 of the size is fine enough
     fraction = min(fits, max(needed, 0), MAX_FRACTION)
     error = 0.5 * 2.0**-fraction
-    if fraction < 0 or error > COARSE * size:
+    if fraction < 0 or error > size / 8:  # which shows
         raise ValueError(
             f"means: SPZ has 24 bits for a position, so {farthest:.3g} world units from the origin the error "
             f"is {error:.2g}, but 1 % of the Gaussians are no larger than {size:.2g}; write a PLY file"
@@ -234,7 +230,8 @@ def _pack(start: tuple[int, ...], data: list[bytes]) -> bytes:
     if start[1] == 4:
         zstd, parts = _zstd(), [part for part in data if part]
         wanted = zstd.CompressionParameter
-        options = {wanted.compression_level: LEVEL, wanted.checksum_flag: 1}
+        # The best level that asks no more memory of a reader.
+        options = {wanted.compression_level: 19, wanted.checksum_flag: 1}
         frames = [zstd.compress(part, options=options) for part in parts]
         table = [ENTRY.pack(len(frame), len(part)) for frame, part in zip(frames, parts, strict=True)]
         return b"".join([HEADER_4.pack(*start, len(parts), HEADER_4.size, bytes(12)), *table, *frames])

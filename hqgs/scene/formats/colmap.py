@@ -25,8 +25,6 @@ from hqgs.scene.photo_files import is_run, of_windows
 from hqgs.scene.scene import Camera, TrackStatistics
 
 _POINT_FILES = (f"{POINTS}.ply", "points.ply", "input.ply")  # in place of COLMAP's own
-CALLED = ("colmap", "distorted", "model", "reconstruction", "sparse")  # in the names of folders of a model
-DEEP = 3  # folders below the one named in which a model is looked for
 
 
 def find_models(root: Path) -> list[Path]:
@@ -51,7 +49,7 @@ def find_models_below(root: Path) -> list[Path]:
     keeps of COLMAP's work is none of the user's.
     """
     inner = [root]
-    for _ in range(DEEP):
+    for _ in range(3):
         inner = [p for folder in inner for p in _folders(folder)]
         for folder in inner:
             models = find_models(folder)
@@ -63,7 +61,7 @@ def find_models_below(root: Path) -> list[Path]:
 def _called_model(folder: Path) -> bool:
     """Whether it has the name of a model, or a number in such a folder (`colmap_output/0`)."""
     name = (folder.parent if folder.name.isdigit() else folder).name.lower()
-    return any(word in name for word in CALLED)
+    return any(word in name for word in ("colmap", "distorted", "model", "reconstruction", "sparse"))
 
 
 def _folders(folder: Path) -> list[Path]:

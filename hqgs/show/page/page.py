@@ -88,8 +88,6 @@ def _number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
-PAIR_SIDE = 720  # px, of a picture
-SCRIPTS = ("splat_shaders.js", "splats.js")
 CHARTS = (
     ("Held-out PSNR", "dB", "psnr", "#2f7fc4"),
     ("Held-out SSIM", "", "ssim", "#d0672a"),
@@ -165,7 +163,9 @@ def page_text(page: Page) -> str:
         scene=None
         if page.gaussians is None
         else _scene(page.scene, page.gaussians, report["config"]["background"]),
-        splats=Markup("\n".join((TEMPLATES / name).read_text(encoding="utf-8") for name in SCRIPTS)),
+        splats=Markup(
+            "\n".join((TEMPLATES / f"{name}.js").read_text("utf-8") for name in ("splat_shaders", "splats"))
+        ),
         pairs=[pair(view, measured.get(view.name)) for view in chosen],
         pairs_left=len(page.views) - len(chosen),
         charts=charts,
@@ -278,7 +278,7 @@ def pair(view: RenderedView, metrics: Mapping[str, Any] | None) -> dict[str, str
     }
 
 
-def jpeg(picture: Image.Image, side: int = PAIR_SIDE) -> str:
+def jpeg(picture: Image.Image, side: int = 720) -> str:
     picture, file = picture.copy(), io.BytesIO()
     picture.thumbnail((side, side), Image.Resampling.LANCZOS)
     picture.save(file, "JPEG", quality=82)

@@ -26,7 +26,6 @@ from hqgs.training.methods.base import Target
 
 BLOCK = 8
 # R, G, B to Y, Cb, Cr (ITU-T T.871, without the offset of the chroma, which no difference sees).
-TO_YCBCR = ((0.299, 0.587, 0.114), (-0.168735892, -0.331264108, 0.5), (0.5, -0.418687589, -0.081312411))
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,9 @@ class JpegCells:
 
     def __init__(self, tables: Tables, height: int, width: int) -> None:
         """`height`, `width`: of the photo, px."""
-        to_ycbcr = np.array(TO_YCBCR)
+        to_ycbcr = np.array(
+            [[0.299, 0.587, 0.114], [-0.168735892, -0.331264108, 0.5], [0.5, -0.418687589, -0.081312411]]
+        )
         rows, columns = (_analysis(side, halve=False) for side in (height, width))
         self._luma = Separable.of(rows, columns, to_ycbcr[:1])
         rows, columns = (_analysis(side, halve=True) for side in (height, width))

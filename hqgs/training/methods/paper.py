@@ -21,7 +21,6 @@ from hqgs.training.methods.base import Method, Target, photo_tensors
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.state import TrainState
 
-SCS_WEIGHT = 5.0  # in L = L1 + 5 L_SCS
 SCS_CACHE_BYTES = 2**30  # of its weights (12 bytes a pixel); those of further views are computed at each step
 # A render dimmer than this part of its target counts as this bright. The gradient of a cosine grows with
 # 1 / |render|: without a floor one faint Gaussian in a black render would get any gradient at all.
@@ -31,7 +30,6 @@ FEATURES = 1000  # F, the rows of F'
 XYZ = 3  # F' feeds the sigmoid directly, so every feature has one number for each coordinate
 # Sobel sums of equal numbers differ by rounding alone up to about this, times the largest |value|. 8-bit
 # photos have steps of at least 1/255, far above it.
-SOBEL_ROUNDING = 1e-5
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ class PaperHQGS(Method[ScsTarget]):
     def loss(self, image: Tensor, target: ScsTarget) -> Tensor:
         loss = photometric_loss(image, target.photo, target.mask, 0.0)
         weights = scs_weights(target.photo, target.mask) if target.weights is None else target.weights
-        return loss + SCS_WEIGHT * scs_loss(image, target.photo, weights)
+        return loss + 5 * scs_loss(image, target.photo, weights)
 
     def rows_changed(self, state: TrainState, parents: Tensor) -> None:
         self.rows = self.rows[parents]
@@ -261,7 +259,7 @@ def edge_magnitude(image: Tensor, mask: Tensor | None = None) -> Tensor:
     else:
         inside, counted = None, magnitude
     low, high = counted.amin(), counted.amax()
-    if high - low <= SOBEL_ROUNDING * values.abs().amax():
+    if high - low <= 1e-5 * values.abs().amax():
         return torch.zeros_like(values)
     # A pixel outside the mask may lie outside the range; it gets 0 below.
     g = (magnitude - low) / (high - low)
