@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,6 +120,39 @@ def test_points_of_another_frame_are_turned(world: NDArray[np.float64], tmp_path
     scene = load_scene(written(replace(truth, points=truth.points @ world.T), tmp_path), test_every=0)
     check(scene, truth)
     assert any("in the frame of the cameras" in note for note in scene.notes)
+
+
+@pytest.mark.parametrize("unit", [0.001, 0.01, 1000.0])
+def test_points_in_another_unit_are_scaled(unit: float, tmp_path: Path) -> None:
+    truth = colored()
+    scene = load_scene(written(replace(truth, points=truth.points * unit), tmp_path), test_every=0)
+    check(scene, truth)
+    assert any(f"scaled by {1 / unit:g} to the unit of the cameras" in note for note in scene.notes)
+
+
+def mixed_up(truth: Truth) -> Truth:
+    return replace(truth, viewmats=np.roll(truth.viewmats, 4, 0))
+
+
+def too_small(truth: Truth) -> Truth:
+    return replace(truth, points=truth.points * 0.5)
+
+
+def too_wide(truth: Truth) -> Truth:
+    fx, fy, *center = truth.params
+    return replace(truth, params=[fx / 2, fy / 2, *center])
+
+
+def shifted(truth: Truth) -> Truth:
+    return replace(truth, points=truth.points + np.array([0.4, 0.3, 0.0]))
+
+
+@pytest.mark.parametrize("spoilt", [mixed_up, too_small, too_wide, shifted])
+def test_what_cannot_be_mended_is_said(spoilt: Callable[[Truth], Truth], tmp_path: Path) -> None:
+    """Photos that have poses of others, a wrong focal length, points of another frame: all in the photos."""
+    said = "photos show other colours where the points are"
+    assert not any(said in note for note in load_scene(written(colored(), tmp_path / "a")).notes)
+    assert any(said in note for note in load_scene(written(spoilt(colored()), tmp_path / "b")).notes)
 
 
 def test_what_no_photo_shows_is_refused(tmp_path: Path) -> None:

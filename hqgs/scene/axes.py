@@ -28,18 +28,22 @@ _PAIRS = 6  # of neighbours, spread over the photos
 _FEWEST, _CLEAR = 30, 3
 _MORE = 1.5  # times as alike, or as many: what differs by less is no better, and the simpler way is taken
 _ASKED = 16  # photos that other frames are tried with
-# Correlation of points' colours with those that photos show there. Of fox, fern, horns, tea, drinks and can
-# it is 0.66 to 0.88 in the true frame, and at most 0.44 in any other that shows half of the points.
-_ALIKE, _BY_CHANCE = 0.5, 5  # standard deviations of what points of any colours have
+# By how much colours of points differ less from a photo where the points are than a little aside. Of fox,
+# fern, horns, tea, drinks and can it is 0.19 to 0.52, under strong blur and noise 0.07 to 0.25; of points or
+# poses that are shifted, scaled or mixed up -0.02 to 0.12.
+_ASIDE = 0.04  # of the longer side
+_ALIKE, _BY_CHANCE = 0.1, 3  # standard deviations of what points of any colours have, at places that differ
 _GREY = 2.0  # levels, standard deviation: points of one colour tell nothing
 _MANY = 0.5  # of the points, that no photo shows: worth a word
+_CORNERS = np.array([[0, 0], [-1, -1], [-1, 1], [1, -1], [1, 1]]) / np.sqrt(2)
 Floats = NDArray[np.float64]
 TURNED = np.diag([1.0, -1.0, -1.0, 1.0])  # y down and z forward for y up and z back, and the other way round
+_UNITS = (1e-3, 1e-2, 1e2, 1e3)  # millimetres and centimetres for metres, and the other way round
 _WORLDS = [
     np.array([s * row for s, row in zip(signs, order, strict=True)])
     for order in permutations(np.eye(3))
     for signs in product((1.0, -1.0), repeat=3)
-]  # the first one is the identity
+] + [unit * np.eye(3) for unit in _UNITS]  # the first one is the identity
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class Way:
 
     @property
     def moves_points(self) -> bool:
-        """Whether points are turned."""
+        """Whether points are turned or scaled."""
         return not np.array_equal(self.world, np.eye(3))
 
     def viewmat(self, photo: Photo) -> Floats:
@@ -75,7 +79,10 @@ class Way:
         if self.turned:
             held = f"the file has {axes[0]}'s axes; its format wants {axes[1]}'s"
             parts.append("the cameras' y and z axes were flipped" + ("" if self.inverse else f" ({held})"))
-        if self.moves_points:
+        scale = float(np.abs(self.world).max())
+        if scale != 1:
+            parts.append(f"the points were scaled by {scale:g} to the unit of the cameras")
+        elif self.moves_points:
             axis = [("-" if row.sum() < 0 else "") + "xyz"[int(np.abs(row).argmax())] for row in self.world]
             parts.append(f"the points' x, y, z are {', '.join(axis)} in the frame of the cameras")
         return " and ".join(parts)
@@ -86,19 +93,20 @@ class _Fit:
     """How points fit photos."""
 
     shown: NDArray[np.bool_]  # [P], by one photo at least
+    places: int  # of photos, _ASIDE apart, that show points
     share: float  # of the points that a photo shows, mean
-    alike: float  # correlation of colours; 0: they tell nothing
+    alike: float  # by how much colours differ less than a little aside, of 1; 0: they tell nothing
 
     @property
     def clear(self) -> bool:
         """Whether colours alone say that the frame is right."""
-        least = max(_ALIKE, _BY_CHANCE / np.sqrt(max(self.shown.sum(), 1)))
+        least = max(_ALIKE, _BY_CHANCE / np.sqrt(max(self.places, 1)))
         return bool(self.alike >= least and self.shown.mean() >= _MANY)
 
     @property
     def by_chance(self) -> bool:
-        """Whether colours of many points are as far from the photos' as any others'."""
-        return self.alike != 0 and self.shown.sum() > 100 and self.alike * np.sqrt(self.shown.sum()) < 1
+        """Whether colours of many points are about as far from the photos' as a little aside."""
+        return self.alike != 0 and self.shown.sum() > 100 and self.alike < _ALIKE
 
 
 def with_true_axes(capture: Capture, views: Sequence[View]) -> tuple[Capture, str | None]:
@@ -122,13 +130,16 @@ def with_true_axes(capture: Capture, views: Sequence[View]) -> tuple[Capture, st
     few = not len(points) or stated.shown.mean() < _MANY or in_one_place(capture)
     if (found := _by_colors(fits, stated)) is None and (few or not stated.alike):
         found, told = _by_matches(capture, views, ways)
-        found = found if told or not few else _by_counts(fits, stated)
-    if found is None and not few and stated.by_chance:
-        note = f"the colours of points and photos do not match (correlation {stated.alike:.2f})"
-        return capture, f"{note}: are points and poses in the same frame?"
-    if found is None:
-        return capture, None
-    way, why = found
+        found = found if told or not few else _by_counts(fits, stated) or found
+    if isinstance(found, tuple):
+        way, why = found
+    elif not few and stated.by_chance:
+        note = "photos show other colours where the points are"
+        return capture, f"{note}: do points, poses and focal lengths belong together, in one frame and unit?"
+    elif found is None and not few and not stated.alike:
+        return capture, "the points have one colour: whether photos show them where they are was not checked"
+    else:
+        return capture, found
     photos = [replace(photo, viewmat=way.viewmat(photo)) for photo in capture.photos]
     seen = None if any(photo.face for photo in photos) else capture.seen
     moved = replace(capture, photos=photos, points=capture.points @ way.world.T, seen=seen)
@@ -143,7 +154,7 @@ def _fits(
     colors: NDArray[np.uint8],
     stated: _Fit,
 ) -> list[tuple[Way, _Fit]]:
-    """How points fit some of the photos in each of the ways; where colours tell, also turned themselves."""
+    """How points fit some of the photos in each of the ways; where colours tell, also turned or scaled."""
     photos = {photo.name: photo for photo in capture.photos}
     asked, found = [views[k] for k in evenly(len(views), _ASKED)], list[tuple[Way, _Fit]]()
     for way in ways if len(points) else ():
@@ -159,8 +170,9 @@ def _by_colors(fits: Sequence[tuple[Way, _Fit]], stated: _Fit) -> tuple[Way, str
     if not clear:
         return None
     way, fit = max(clear, key=lambda one: one[1].alike)
-    how = f"of {fit.alike:.2f} then, of {stated.alike:.2f} as the files have them"
-    return way, f"the colours of points and photos have a correlation {how}"
+    then, now = (f"{max(one.alike, 0):.0%}" for one in (fit, stated))
+    how = f"differences {then} below those a little aside; {now} as the files have them"
+    return way, f"then the points have the colours of the photos ({how})"
 
 
 def _by_counts(fits: Sequence[tuple[Way, _Fit]], stated: _Fit) -> tuple[Way, str] | None:
@@ -179,28 +191,28 @@ def _by_counts(fits: Sequence[tuple[Way, _Fit]], stated: _Fit) -> tuple[Way, str
 def _fit(
     views: Sequence[View], viewmats: Sequence[Floats], points: Floats, colors: NDArray[np.uint8]
 ) -> _Fit:
-    counts, sums, shares = np.zeros(len(points)), np.zeros((len(points), 3)), [0.0]
+    shown, errors, shares, cells = np.zeros(len(points), bool), [np.zeros((5, 0))], [0.0], 0
     for view, viewmat in zip(views if len(points) else (), viewmats, strict=False):
         pixels, depths = project(replace(view.camera, viewmat=viewmat), points)
         inside = within(view.camera, pixels, depths)
-        columns, rows = pixels[inside].astype(np.intp).T
-        counts += inside
-        sums[inside] += as_floats(view.image[rows, columns])
+        aside = _ASIDE * max(view.camera.width, view.camera.height)
+        places = pixels + aside * _CORNERS[:, None]
+        asked = np.all([within(view.camera, place, depths) for place in places], 0)
+        columns, rows = np.moveaxis(places[:, asked].astype(np.intp), 2, 0)
+        errors.append(np.abs(as_floats(view.image[rows, columns]) - as_floats(colors[asked])).mean(2))
+        cells += len(np.unique(pixels[inside] // aside, axis=0))
+        shown |= inside
         shares.append(float(inside.mean()))
-    shown = counts > 0
-    theirs, own = sums[shown] / counts[shown, None], as_floats(colors[shown])
-    theirs, own = (values - values.mean(0) for values in (theirs, own)) if shown.any() else (theirs, own)
-    spread = np.sqrt(np.square(theirs).sum() * np.square(own).sum())
-    told = shown.any() and min(theirs.std(), own.std()) > _GREY / 255
-    return _Fit(
-        shown, float(np.mean(shares[1:] or shares)), float((theirs * own).sum() / spread) if told else 0.0
-    )
+    here, *beside = np.concatenate(errors, 1)
+    told = len(here) and colors[shown].std(0).max() > _GREY and np.mean(beside)
+    alike = 1 - float(here.mean() / np.mean(beside)) if told else 0.0
+    return _Fit(shown, cells, float(np.mean(shares[1:] or shares)), alike)
 
 
 def _by_matches(
     capture: Capture, views: Sequence[View], ways: Sequence[Way]
-) -> tuple[tuple[Way, str] | None, bool]:
-    """The same by matches between neighbours; and whether they say that the stated one is right."""
+) -> tuple[tuple[Way, str] | str | None, bool]:
+    """The same by matches between neighbours, or what to say where they fit no way; and whether they tell."""
     photos = {photo.name: photo for photo in capture.photos}
     counts, told = np.zeros(len(ways) + 1, int), pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING.value)
@@ -215,6 +227,9 @@ def _by_matches(
         more = count >= _CLEAR * other or matches - other >= _CLEAR * (matches - count)
         return count >= other + _FEWEST and more
 
+    if 2 * max(fitting) < matches and matches > 2 * _FEWEST:
+        note = f"{fitting[0]} of {matches} matches between neighbouring photos fit their poses"
+        return f"{note}: do poses, focal lengths and photos belong together?", False
     best = next(k for k, count in enumerate(fitting) if not beats(max(fitting), count))
     if best == 0:
         return None, all(beats(fitting[0], count) for count in fitting[1:])
