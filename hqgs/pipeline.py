@@ -10,7 +10,17 @@ from tempfile import TemporaryDirectory
 from typing import cast
 
 from hqgs import __version__
-from hqgs.base.files import CHECKPOINT, CONFIG, PAGE, PLAN, PLY, lock_folder, remove_leftovers, write_json
+from hqgs.base.files import (
+    CHECKPOINT,
+    CONFIG,
+    PAGE,
+    PLAN,
+    PLY,
+    lock_folder,
+    remove_leftovers,
+    write_json,
+    write_text,
+)
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import give_back_memory, peak_rss_mb
@@ -27,7 +37,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.photo_files import strangers
 from hqgs.scene.scene import Scene
-from hqgs.show.page.page import Page, summary_html, write_page
+from hqgs.show.page.page import page_text, summary_html
 from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import Said, TrainConfig, TrainOptions, decided, merged
 from hqgs.training.frame import Frame
@@ -315,5 +325,5 @@ def _report(
         write_json(out / PLAN, plan_values(config, rows))
     report = write_report(out, record, views)
     if out is not None:
-        write_page(out / PAGE, Page(report, scene, model, views, diagnosis))
+        write_text(out / PAGE, page_text(report, scene, model, views, diagnosis))
     return report

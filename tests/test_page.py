@@ -19,7 +19,7 @@ from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
 from hqgs.show.page.packing import pack_scene
-from hqgs.show.page.page import Page, line_chart, page_text, told_verdict
+from hqgs.show.page.page import line_chart, page_text, told_verdict
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +27,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> hqgs.Run:
     return hqgs.train(tiny_scene(), out=tmp_path_factory.mktemp("run"), config=tiny_config())
 
 
-def page_of(run: hqgs.Run, **changes: Any) -> Page:
-    return replace(Page(run.report, tiny_scene(), run.model, run.views, None), **changes)
+def page_of(run: hqgs.Run, **changes: Any) -> str:
+    shown: dict[str, Any] = {
+        "report": run.report,
+        "scene": tiny_scene(),
+        "gaussians": run.model,
+        "views": run.views,
+    }
+    return page_text(**(shown | changes))
 
 
 def test_a_run_has_its_page(run: hqgs.Run) -> None:
@@ -45,7 +51,7 @@ def test_a_run_has_its_page(run: hqgs.Run) -> None:
 
 
 def test_nothing_is_loaded_from_elsewhere(run: hqgs.Run) -> None:
-    text = page_text(page_of(run))
+    text = page_of(run)
     assert "default-src 'none'" in text
     without_data = re.sub(r'"data:[^"]*"', '""', text)
     assert not re.search(r'(src|href)\s*=\s*"[^"]', without_data)
@@ -61,18 +67,18 @@ def test_names_from_files_are_text(run: hqgs.Run) -> None:
         "notes": [rude],
         "left_out": [{"what": rude, "why": rude}],
     }
-    text = page_text(page_of(run, scene=scene, report=report, views=[replace(run.views[0], name=rude)]))
+    text = page_of(run, scene=scene, report=report, views=[replace(run.views[0], name=rude)])
     assert "alert(1)" in text
     assert "<script>alert" not in text
     assert "<img src=x" not in text
-    assert text.count("</script>") == page_text(page_of(run)).count("</script>")
+    assert text.count("</script>") == page_of(run).count("</script>")
 
 
 def test_a_page_without_scene_views_or_history(run: hqgs.Run) -> None:
     report: Any = dict(run.report)
     report["history"] = []
     report["metrics"] = {"mean": dict.fromkeys(run.report["metrics"]["mean"]), "views": [], "reasons": {}}
-    text = page_text(page_of(run, report=report, gaussians=None, views=[]))
+    text = page_of(run, report=report, gaussians=None, views=[])
     assert "<canvas" not in text
     assert text.count("not measured while it trained") == 4
     assert told_verdict(report) == "Quality: not measured. No photo was held out: look at the renders."
@@ -85,14 +91,14 @@ def test_a_page_without_scene_views_or_history(run: hqgs.Run) -> None:
 def test_the_diagnosis_is_told(run: hqgs.Run) -> None:
     scene = tiny_scene()
     diagnosis = hqgs.diagnose(scene)
-    text = page_text(page_of(run, diagnosis=diagnosis))
+    text = page_of(run, diagnosis=diagnosis)
     for part in diagnosis.parts:
         assert part.reason in text
     assert "Each of the 5 measured photos" in text
 
 
 def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
-    assert "What was learned" not in page_text(page_of(run))
+    assert "What was learned" not in page_of(run)
     way = [[0.5 * k, 0.0] for k in range(-4, 5)]
     learned = [
         {
@@ -114,7 +120,7 @@ def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
         },
     ]
     report: Any = {**run.report, "learned": learned}
-    text = page_text(page_of(run, report=report))
+    text = page_of(run, report=report)
     cells = "".join(
         f"<td>{cell}</td>"
         for cell in ("a&lt;b&gt;.png", "4.0 px", "sharp", "+0.33", "+0.67", "+0.67", "-1.33")

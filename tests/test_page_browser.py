@@ -18,7 +18,7 @@ from tiny_scene import tiny_scene
 import hqgs
 from hqgs.scene.paths import with_size
 from hqgs.scene.scene import Scene
-from hqgs.show.page.page import Page, write_page
+from hqgs.show.page.page import page_text
 
 SIZE = (120, 80)
 BEHIND = (0.1, 0.5, 0.8)
@@ -39,7 +39,8 @@ def trained() -> tuple[hqgs.Run, Scene]:
 def test_the_page(trained: tuple[hqgs.Run, Scene], tmp_path: Path) -> None:
     run, scene = trained
     assert run.model.sh_degree == 3
-    write_page(tmp_path / "report.html", Page(run.report, scene, run.model, run.views))
+    page = tmp_path / "report.html"
+    page.write_text(page_text(run.report, scene, run.model, run.views), encoding="utf-8")
     asked: list[str] = []
     with chromium() as (page, wrong):
         page.on("request", lambda r: asked.append(r.url))
@@ -100,7 +101,8 @@ def test_the_page(trained: tuple[hqgs.Run, Scene], tmp_path: Path) -> None:
 
 def test_a_browser_without_webgl_is_told(trained: tuple[hqgs.Run, Scene], tmp_path: Path) -> None:
     run, scene = trained
-    write_page(tmp_path / "report.html", Page(run.report, replace(scene, name="x"), run.model, run.views))
+    page = tmp_path / "report.html"
+    page.write_text(page_text(run.report, replace(scene, name="x"), run.model, run.views), encoding="utf-8")
     with chromium() as (page, _):
         page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
         page.goto(f"file://{tmp_path / 'report.html'}")

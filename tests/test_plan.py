@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import FrozenInstanceError, asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from test_learned_cameras import textured_scene
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.base.files import CHECKPOINT, PAGE, PLAN
+from hqgs.base.typed import build
 from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.pipeline import open_run
@@ -45,7 +46,7 @@ def test_a_plan_follows_from_facts_alone_and_comes_back_from_json() -> None:
         == prepared.plan()
         == Trainer(tiny_scene(), config).plan
     )
-    assert RunPlan.of_values(json.loads(json.dumps(plan.values())), "here") == plan
+    assert build(RunPlan, json.loads(json.dumps(asdict(plan))), "here") == plan
     with pytest.raises(FrozenInstanceError):
         plan.discs = True  # type: ignore[misc]
     assert all(row.what and row.value and row.why and row.rule for row in plan.rows)

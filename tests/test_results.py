@@ -26,7 +26,6 @@ from benchmarks.pages.sections import (
     over_time,
     seeds_apart,
     then,
-    where,
 )  # fmt: skip
 from benchmarks.pages.write import RESULTS, STUDIES, pages
 from benchmarks.rows import KEYS, RUN, Table, pairs_of, text_of
@@ -168,7 +167,6 @@ def test_seconds_by_hand() -> None:
         run_of("60 s", 27.95, seconds=61.0, setup_seconds=2, history=""),
     )  # fmt: skip
     assert set(ours(times)["row"]) == {"3dgs", "30 s", "60 s"}
-    assert where(times, "OpenSplat") == "2 cores of CPU, 2026-11-26"
     assert [then("9:20|31:25", seconds) for seconds in (5.0, 30.0, 31.0)] == [None, 20.0, 25.0]
     assert after(times, "a", "3dgs", 30.0) == 20.0
     assert over_time(times, ["a"], "OpenSplat").splitlines()[-1] == "| a | +4.00 | +3.95 |"

@@ -110,12 +110,6 @@ def ours(times: DataFrame) -> DataFrame:
     return times.loc[~times["row"].isin(EXTERNAL)]
 
 
-def where(times: DataFrame, row: str) -> str:
-    """Machine and day of a row: `2 cores of AMD EPYC, 2026-11-23`."""
-    line = records(pick(times, row=row))[0]
-    return f"{line['threads']:.0f} cores of {line['machine']}, {line['date']}"
-
-
 def then(history: str, seconds: float) -> float | None:
     """The PSNR of a run after so many of its seconds; None before its first evaluation."""
     known = [psnr for at, psnr in pairs_of(history) if float(at) <= seconds]

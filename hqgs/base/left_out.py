@@ -4,26 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, TypedDict, cast
 
 from hqgs.base.text import some
-
-if TYPE_CHECKING:
-    from typing_extensions import NotRequired  # typing has it from Python 3.11 on
 
 PHOTO = "training photo "  # and its name
 CORRECTION = "a correction for "  # and the step of the formation, of what the photos do not show
 DIAGNOSIS = "diagnosis of "  # and what was not measured in each photo
 MOST_ROWS = 5  # on the screen
 Row = tuple[str, str]  # what, why
-
-
-class LeftOutRecord(TypedDict):
-    """`LeftOut` as JSON: what is not known is not there."""
-
-    what: str
-    why: str
-    evidence: NotRequired[str]
 
 
 @dataclass(frozen=True)
@@ -34,10 +22,9 @@ class LeftOut:
     why: str
     evidence: str | None = None  # what was measured to decide it
 
-    def known(self) -> LeftOutRecord:
-        """The fields that are known, as plain JSON values."""
-        known = {name: value for name, value in asdict(self).items() if value is not None}
-        return cast(LeftOutRecord, known)
+    def known(self) -> dict[str, str]:
+        """The fields that are known, as JSON values."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 def format_left_out(items: Sequence[LeftOut]) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 
 MAX_HEADER_BYTES = 1 << 16
@@ -43,7 +44,7 @@ def header_of(path: Path) -> Header:
     return Header(head[: end.start()].decode("latin-1").splitlines(), end.end(), head[: end.end()].isascii())
 
 
-def read_vertices(path: str | Path) -> np.ndarray[Any, np.dtype[np.void]]:
+def read_vertices(path: str | Path) -> NDArray[np.void]:
     """The element `vertex` as a structured array [N], a field for each property; others are passed by.
 
     The file may be text or binary of either byte order. A header that promises more than the file holds is
@@ -57,7 +58,7 @@ def read_vertices(path: str | Path) -> np.ndarray[Any, np.dtype[np.void]]:
     return elements["vertex"]
 
 
-def read_elements(path: str | Path) -> dict[str, np.ndarray[Any, np.dtype[np.void]]]:
+def read_elements(path: str | Path) -> dict[str, NDArray[np.void]]:
     """All elements by name; see `read_vertices`."""
     path = Path(path)
     header = header_of(path)
@@ -84,6 +85,27 @@ def read_elements(path: str | Path) -> dict[str, np.ndarray[Any, np.dtype[np.voi
     except (PlyParseError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{path}: not a readable PLY file: {error}") from error
     return {element.name: element.data for element in ply.elements}
+
+
+def read_points(
+    path: Path,
+) -> tuple[np.ndarray[Any, np.dtype[np.float64]], np.ndarray[Any, np.dtype[np.uint8]]]:
+    """Points [P, 3] and colours [P, 3] of the PLY's `vertex` element; grey where it has no red, green, blue.
+
+    Raises ValueError that names the file.
+    """
+    vertex = read_vertices(path)
+    try:
+        points = np.stack([vertex[k].astype(np.float64) for k in ("x", "y", "z")], -1)
+        colors = np.full((len(points), 3), 128, np.uint8)
+        if {"red", "green", "blue"} <= set(vertex.dtype.names or ()):
+            colors = np.stack([vertex[k] for k in ("red", "green", "blue")], -1)
+            if colors.dtype.kind == "f":
+                colors = np.rint(np.nan_to_num(colors) * 255)
+            colors = colors.clip(0, 255).astype(np.uint8)
+    except (ValueError, KeyError, TypeError, OverflowError) as e:
+        raise ValueError(f"cannot read the points in {path}: {e}") from e
+    return points, colors
 
 
 class _Plain(io.BufferedReader):

@@ -128,7 +128,7 @@ class _Joined(Ranks):
                 raise ValueError(f"{name} is not set: start several processes with torchrun")
         store, self.rank, self.count = next(rendezvous("env://", timeout=timedelta(seconds=SILENCE)))
         # torchrun's store outlives a restart, with the addresses of those who were there before.
-        store = PrefixStore(f"start {_restarts()}", store)
+        store = PrefixStore(f"start {restarts()}", store)
         dist.init_process_group(
             "gloo", store=store, rank=self.rank, world_size=self.count, timeout=timedelta(seconds=SILENCE)
         )
@@ -261,10 +261,6 @@ def joined() -> Iterator[Ranks]:
         ranks.end()
 
 
-def was_restarted() -> bool:
-    """Whether torchrun has started this process in the place of one that failed."""
-    return _restarts() > 0
-
-
-def _restarts() -> int:
+def restarts() -> int:
+    """How often torchrun has started this process in the place of one that failed."""
     return int(os.environ.get("TORCHELASTIC_RESTART_COUNT") or 0)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from hqgs import __version__
-from hqgs.base.files import CONFIG, write_json
+from hqgs.base.files import CONFIG, write_json, write_text
 from hqgs.base.options import Color
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import MeasuredOptions, check_background, check_out_folder, measured_scene, ready
@@ -84,10 +84,10 @@ def run(options: Judge) -> int:
     psnr, name = judged_by({**(run.report or {}), "metrics": {"mean": found["scene"]["mean"]}})
     found["judged_by"] = {"psnr": psnr, "name": name}
     if options.out is not None:
-        from hqgs.show.page.judge_page import write_judge_page
+        from hqgs.show.page.judge_page import judge_page
 
         write_json(options.out / NUMBERS, found)
-        write_judge_page(options.out / PAGE, found, judged)
+        write_text(options.out / PAGE, judge_page(found, judged))
     print(judgement(found))
     if options.out is not None:
         print(f"\n{options.out / PAGE}: photos beside renders, and where the errors are")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
@@ -158,22 +157,11 @@ def _evaluated(now: Progress) -> str:
     return f"{where}, {which} {', '.join(values)}"
 
 
-@dataclass(frozen=True)
-class Times:
-    """When the parts of a command began, s."""
-
-    start: float
-    loaded: float
-    trained_from: float
-    trained_to: float
-    end: float
-
-    def told(self, colmap: float) -> str:
-        """How long each part took; `colmap`: s, of the loading."""
-        of_it = f" (COLMAP {duration(colmap)})" if colmap >= 1 else ""
-        return (
-            f"{duration(self.end - self.start)}: loading {duration(self.loaded - self.start)}{of_it}, "
-            f"preparing {duration(self.trained_from - self.loaded)}, "
-            f"training {duration(self.trained_to - self.trained_from)}, "
-            f"report {duration(self.end - self.trained_to)}"
-        )
+def told_times(start: float, loaded: float, bar: TrainingScreen, colmap: float) -> str:
+    """How long each part of a run took until now; `colmap`: s, of the loading."""
+    began, ended, end = bar.began or loaded, bar.ended or loaded, time.perf_counter()
+    of_it = f" (COLMAP {duration(colmap)})" if colmap >= 1 else ""
+    return (
+        f"{duration(end - start)}: loading {duration(loaded - start)}{of_it}, preparing "
+        f"{duration(began - loaded)}, training {duration(ended - began)}, report {duration(end - ended)}"
+    )

@@ -18,10 +18,10 @@ import hqgs
 from hqgs.base.files import CHECKPOINT, PAGE, PLY, lock_folder
 from hqgs.base.left_out import format_left_out
 from hqgs.base.options import Flag, Folder, Number, Unsaid
-from hqgs.base.ranks import RankError, Ranks, joined, was_restarted
+from hqgs.base.ranks import RankError, Ranks, joined, restarts
 from hqgs.cli.errors import fail
 from hqgs.cli.parse import parse
-from hqgs.cli.progress import LoadingScreen, Times, TrainingScreen, duration
+from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration, told_times
 from hqgs.cli.scenes import Photos, check_out, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.run_folder import RunFolder
@@ -138,8 +138,7 @@ def run(options: Train) -> int:
     code = 0 if done.finished else 130
     if not ranks.first:
         return code
-    times = Times(started, loaded, bar.began or loaded, bar.ended or loaded, time.perf_counter())
-    _summary(options, done, screen.colmap_seconds, times)
+    _summary(options, done, told_times(started, loaded, bar, screen.colmap_seconds))
     if not done.finished:
         command = shlex.join(["hqgs", "train", options.scene, "--out", str(out), "--resume"])
         print(
@@ -170,7 +169,7 @@ def restarted(out: Path, overwrite: bool, ranks: Ranks) -> bool:
 
     With `overwrite` a first start removes the checkpoint there, or a restart would go on with the older run.
     """
-    if was_restarted():
+    if restarts():
         return True
     if overwrite and ranks.count > 1 and ranks.first and out.is_dir():
         with lock_folder(out):
@@ -251,7 +250,7 @@ def loading(options: Train, config: TrainConfig) -> dict[str, Any]:
     )
 
 
-def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:
+def _summary(options: Train, done: Run, times: str) -> None:
     out, last = options.out, done.history[-1]
     numbers = [f"{done.iterations} iterations", f"{len(done.model)} Gaussians", f"{done.seconds:.0f} s"]
     found, ssim = (told(done.report, *form) for form in (("psnr", ".2f"), ("ssim", ".4f")))
@@ -264,7 +263,7 @@ def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:
     print(f"quality: {word} ({why})" + ("" if psnr in (None, last["psnr"]) else f"; {psnr:.2f} dB {name}"))
     if fell := done.report.get("fallen") or overdone(done.history):
         print(fell)
-    print(f"time: {times.told(colmap)}")
+    print(f"time: {times}")
     print(f"to share: {out / PAGE} opens in any browser; {VIEWERS} open {out / PLY}")
     if not options.view:
         print(f"next, to see it: {shlex.join(['hqgs', 'view', str(out)])}")

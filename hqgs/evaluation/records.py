@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, cast
 
 from hqgs.base.files import read_json
-from hqgs.base.left_out import LeftOutRecord
 from hqgs.base.machine import MachineFacts
 
 if TYPE_CHECKING:
@@ -88,7 +87,7 @@ class RunRecord(TypedDict):
     scene_bytes: int | None  # of scene.ply; None: nothing was written
     peak_rss_mb: float | None
     history: list[HistoryEntry]
-    left_out: list[LeftOutRecord]
+    left_out: list[dict[str, str]]  # `LeftOut`, what is known of each
     guard: GuardRecord
     world: WorldRecord | None
     place: dict[str, Json] | None  # `Georeference`, by the photos' GPS; None: it does not tell

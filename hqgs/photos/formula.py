@@ -105,7 +105,10 @@ class DegradationStep:
 
     def __str__(self) -> str:
         name = f"{SOME}:{self.kind}" if self.some else self.kind
-        return name if self.value is None else f"{name}:{_shortest(self.value)}"
+        if self.value is None:
+            return name
+        # The shortest text that reads back as the value.
+        return f"{name}:{int(self.value) if self.value == int(self.value) else float(self.value)!r}"
 
 
 @dataclass(frozen=True)
@@ -227,8 +230,3 @@ def _number(text: str, part: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text!r} in the degradation {part!r} is not a number")
     return value
-
-
-def _shortest(value: float) -> str:
-    """The shortest text that reads back as `value`."""
-    return repr(int(value)) if value == int(value) else repr(float(value))

@@ -96,33 +96,16 @@ def calibrated(held: Sequence[Held]) -> float:
     return max(float(np.quantile(np.concatenate([one.needed() for one in held]), SHARE)), 0.0)
 
 
-class LazyTrust:
-    """Of one scene, learned when it is first asked for."""
-
-    def __init__(self, known: RunCameras | None) -> None:
-        self._known = known
-        self._trust: Trust | None = None
-
-    def possible(self, gaussians: Gaussians) -> bool:
-        """Whether the run has training photos, or the file of the Gaussians says their errors."""
-        if gaussians.errors is not None:
-            return True
-        views = [] if self._known is None else self._known.views
-        return any(shows(view) for view in views if not view.held_out)
-
-    def of(self, gaussians: Gaussians) -> Trust:
-        """ValueError where it is not possible."""
-        if self._trust is None or self._trust.gaussians is not gaussians:
-            self._trust = trust_of(gaussians, self._known)
-        return self._trust
-
-
 def trust_of(gaussians: Gaussians, known: RunCameras | None) -> Trust:
     """Of a run's photos; or without them, what the file of the Gaussians says. ValueError without either."""
-    photos = known is not None and any(shows(view) for view in known.views if not view.held_out)
-    if gaussians.errors is not None and not photos:
+    if gaussians.errors is not None and not has_photos(known):
         return Trust(gaussians, gaussians.errors)
     return learn_trust(gaussians, known or RunCameras(np.zeros(3), []))
+
+
+def has_photos(known: RunCameras | None) -> bool:
+    """Whether there are training photos to learn from."""
+    return known is not None and any(shows(view) for view in known.views if not view.held_out)
 
 
 def learn_trust(gaussians: Gaussians, known: RunCameras) -> Trust:

@@ -7,12 +7,10 @@ clock or by photos that are held back, is added to the run's rows with the itera
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, cast
+from dataclasses import dataclass, field
 
 from hqgs.base.left_out import CORRECTION, LeftOut
 from hqgs.base.text import aligned
-from hqgs.base.typed import build
 from hqgs.evaluation.constants import SCATTER
 from hqgs.evaluation.records import PlanRowRecord
 from hqgs.training.config import TrainConfig
@@ -87,10 +85,9 @@ class PlanRow:
 
     def known(self) -> PlanRowRecord:
         """As the report has it."""
-        values = {"evidence": self.evidence, "rule": self.rule, "iteration": self.iteration}
-        known = {name: value for name, value in values.items() if value}
-        row = {"what": self.what, "value": self.value, "why": self.why, **known}
-        return cast(PlanRowRecord, row)
+        more = {"evidence": self.evidence, "rule": self.rule, "iteration": self.iteration}
+        known = {name: value for name, value in more.items() if value}
+        return {"what": self.what, "value": self.value, "why": self.why, **known}
 
 
 @dataclass(frozen=True)
@@ -105,15 +102,6 @@ class RunPlan:
     half_size_until: int = 0  # the last iteration at half the photos' sides; 0: there is none
     clock_most: int = 0  # iterations that the clock may give the run after growth; 0: it does not look at it
     rows: tuple[PlanRow, ...] = field(default=(), repr=False)
-
-    def values(self) -> dict[str, Any]:
-        """As JSON values; `of_values` reads them."""
-        return asdict(self)
-
-    @staticmethod
-    def of_values(values: Any, where: str) -> RunPlan:
-        """The plan of JSON values, of `where`. ValueError names the field."""
-        return build(RunPlan, values, where)
 
     def __str__(self) -> str:
         return plan_table(self.rows)

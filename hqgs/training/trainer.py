@@ -17,6 +17,7 @@ from torch import Tensor
 from hqgs.base.left_out import LeftOut
 from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.threads import one_torch_thread
+from hqgs.base.typed import build
 from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.evaluation.held_out import HeldOutViews, history_entry
 from hqgs.evaluation.looks import looks_of_devices
@@ -237,7 +238,7 @@ class Trainer:
         meta = self.state.values() | {
             "recent": list(self.state.recent) if self.plan.clock_most else [],
             "asked": config_values(self.asked),
-            "plan": self.plan.values(),
+            "plan": asdict(self.plan),
             "tried": self.prepared.facts.tried and asdict(self.prepared.facts.tried),
             "looks": {name: asdict(tried) for name, tried in self.prepared.facts.looks.items()},
             "scene": checkpoint.scene_fingerprint(self.scene),
@@ -254,7 +255,7 @@ class Trainer:
         tensors, meta = checkpoint.load_checkpoint(path)
         try:
             checkpoint.check_scene(path, meta["scene"], self.scene)  # first: methods go by the scene
-            saved, asked = RunPlan.of_values(meta["plan"], f"{path}: plan"), config_values(self.asked)
+            saved, asked = build(RunPlan, meta["plan"], f"{path}: plan"), config_values(self.asked)
             done, decisions = meta["iteration"], meta["decisions"]
             ended = done == decisions["length"] and self.asked.seconds is None
             more = self.plan.settings.iterations

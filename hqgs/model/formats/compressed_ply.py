@@ -86,11 +86,6 @@ def write_compressed_ply(path: Path, arrays: Arrays) -> int:
     return left_out
 
 
-def is_compressed_ply(path: Path) -> bool:
-    """Whether the header of a PLY file says so."""
-    return any("packed_position" in line for line in header_of(path).lines if "property" in line)
-
-
 def read_compressed_ply(path: Path) -> Arrays:
     """Read such a file. ValueError where it is damaged."""
     told, elements = told_by(header_of(path).comments), read_elements(path)

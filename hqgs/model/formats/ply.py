@@ -32,7 +32,7 @@ from hqgs.model.formats.arrays import (
     to_logits,
     whole_rows,
 )
-from hqgs.model.formats.compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
+from hqgs.model.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from hqgs.model.formats.ply_comments import OURS, comments_of, told_by
 from hqgs.scene.world import World, world_for
 
@@ -212,7 +212,9 @@ def _plain_colors(vertices: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _read_any_ply(path: Path) -> Arrays:
-    return read_compressed_ply(path) if is_compressed_ply(path) else read_ply(path)
+    lines = header_of(path).lines
+    packed = any("packed_position" in line for line in lines if "property" in line)
+    return read_compressed_ply(path) if packed else read_ply(path)
 
 
 FORMATS = {

@@ -10,13 +10,13 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hqgs.base.ply import read_points
 from hqgs.base.text import some
 from hqgs.scene.capture import NO_POSE, Capture, Photo, keep_finite, list_photos, no_points, viewmat_from_pose
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap_binary import cameras_file_size, check_binary_model, image_names
 from hqgs.scene.formats.colmap_mended import NEEDED, POINTS, kind_of, mended, whole_names
 from hqgs.scene.formats.colmap_photos import photos_of
-from hqgs.scene.formats.point_files import read_ply_points
 from hqgs.scene.geometry import project
 from hqgs.scene.masks import masks_of
 from hqgs.scene.named_split import held_out, listed_split, names_by_any
@@ -131,7 +131,10 @@ def _largest_model(root: Path) -> tuple[Path, pycolmap.Reconstruction, list[str]
     """The model with most photos, where it is, and notes."""
     found = find_models(root) or find_models_below(root)
     told: dict[Path, list[str]] = {path: [] for path in found}
-    models = {path: _read_model(path, told[path]) for path in found}
+    models = dict[Path, pycolmap.Reconstruction]()
+    for path in found:
+        with mended(path, told[path]) as place:
+            models[path] = _read_whole(place)
     path = max(models, key=lambda p: (models[p].num_reg_images(), models[p].num_points3D()))
     model, notes = models.pop(path), told[path]
     if path not in find_models(root):
@@ -187,7 +190,7 @@ def _points(folder: Path, notes: list[str]) -> tuple[NDArray[np.float64], NDArra
     if path is None:
         return no_points()
     notes.append(f"the model has no points; those of {path.name} beside it are used")
-    return read_ply_points(path)
+    return read_points(path)
 
 
 def _tracks(model: pycolmap.Reconstruction, path: Path) -> TrackStatistics | None:
@@ -200,13 +203,8 @@ def _tracks(model: pycolmap.Reconstruction, path: Path) -> TrackStatistics | Non
         raise ValueError(f"{path}: a point refers to a photo that is not in the model: {e}") from e
 
 
-def _read_model(folder: Path, notes: list[str]) -> pycolmap.Reconstruction:
-    with mended(folder, notes) as place:
-        return _read_whole(place, kind_of(place) == "bin")
-
-
-def _read_whole(folder: Path, binary: bool) -> pycolmap.Reconstruction:
-    model = pycolmap.Reconstruction()
+def _read_whole(folder: Path) -> pycolmap.Reconstruction:
+    model, binary = pycolmap.Reconstruction(), kind_of(folder) == "bin"
     if binary:
         check_binary_model(folder)
     try:

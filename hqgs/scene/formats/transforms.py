@@ -15,11 +15,11 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.base.files import read_json
+from hqgs.base.ply import read_points
 from hqgs.photos.files import UnreadableError, stored_size
 from hqgs.scene.capture import Capture, Photo, files_named, inside, keep_finite, no_points, viewmat_from_pose
 from hqgs.scene.constants import MOST_SIDE, SMALLEST_SIDE
 from hqgs.scene.faces import AROUND, around
-from hqgs.scene.formats.point_files import read_ply_points
 from hqgs.scene.masks import masks_of
 from hqgs.scene.named_split import held_out, lists_in, names_by_any
 from hqgs.scene.photo_files import MASKS, Named
@@ -102,7 +102,7 @@ def read_transforms(root: Path, downscale: float) -> Capture:
         if path is None or not path.is_file():
             notes.append(f"ply_file_path {ply!r} is not a file in {root}")
         else:
-            points, colors = keep_finite(*read_ply_points(path), notes)
+            points, colors = keep_finite(*read_points(path), notes)
     return Capture("transforms", photos, downscale, points, colors, test_names=test_names, notes=notes)
 
 

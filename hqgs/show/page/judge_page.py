@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.base.files import write_text
 from hqgs.evaluation.constants import PATCH, SHEET_PHOTOS
 from hqgs.evaluation.judge import Judged
 from hqgs.evaluation.verdict import (
@@ -33,13 +32,11 @@ from hqgs.show.trust import WORST_SHOWN
 COLORS = ("#d0672a", "#8a5fbf", "#7a7a7a", "#b8c4d0", "#c9b458", "#2f7fc4", "#3f9b57")
 
 
-def write_judge_page(path: Path, found: dict[str, Any], judged: Sequence[Judged]) -> None:
-    """Write the page atomically: `found` is what judge.json holds, `judged` the scene, and the other one."""
-    write_text(path, judge_page(found, judged))
-
-
 def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
-    """The page as HTML. Names from files are escaped; nothing in it is loaded from elsewhere."""
+    """The page as HTML: `found` is what judge.json holds, `judged` the scene, and the other one.
+
+    Names from files are escaped; nothing in it is loaded from elsewhere.
+    """
     one, against, protocol = found["scene"], found.get("against"), found["protocol"]
     shown = [name for name in LABELS if one["mean"][name] is not None]
     order = sorted(one["views"], key=lambda name: one["views"][name]["psnr"] or np.inf)

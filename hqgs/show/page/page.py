@@ -6,7 +6,6 @@ import base64
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +15,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.base.evenly import evenly
-from hqgs.base.files import write_text
-from hqgs.base.left_out import CORRECTION, LeftOutRecord
+from hqgs.base.left_out import CORRECTION
 from hqgs.diagnosis.photo import PhotoDiagnosis
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.constants import MOST_CAMERAS
 from hqgs.evaluation.held_out import RenderedView, names_of
-from hqgs.evaluation.records import (
-    HistoryEntry,
-    Json,
-    LearnedRecord,
-    PlanRowRecord,
-    Report,
-    ViewMetricValues,
-    alike,
-)
+from hqgs.evaluation.records import Json, LearnedRecord, PlanRowRecord, Report, ViewMetricValues, alike
 from hqgs.evaluation.verdict import judged_by, told, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
@@ -96,17 +86,6 @@ CHARTS = (
 )
 
 
-@dataclass(frozen=True)
-class Page:
-    """What a page shows. Without Gaussians it has no scene to fly through."""
-
-    report: Report
-    scene: Scene
-    gaussians: Gaussians | None
-    views: Sequence[RenderedView] = field(repr=False)
-    diagnosis: Diagnosis | None = None
-
-
 def told_verdict(report: Report) -> str:
     """What came out, in words, with the number that it goes by."""
     psnr, name = judged_by(report)
@@ -137,37 +116,43 @@ def summary_html(report: Report, views: Sequence[RenderedView]) -> str:
     return str(Markup("").join(parts))
 
 
-def write_page(path: str | Path, page: Page) -> None:
-    """Write the page atomically. OSError where it cannot be written."""
-    write_text(path, page_text(page))
+def page_text(
+    report: Report,
+    scene: Scene,
+    gaussians: Gaussians | None,
+    views: Sequence[RenderedView],
+    diagnosis: Diagnosis | None = None,
+) -> str:
+    """The page as HTML. Without Gaussians it has no scene to fly through.
 
-
-def page_text(page: Page) -> str:
-    """The page as HTML. Names from files are escaped; nothing in it is loaded from elsewhere."""
-    report, history = page.report, page.report["history"]
+    Names from files are escaped; nothing in it is loaded from elsewhere.
+    """
+    history = report["history"]
     measured = {view["name"]: view for view in report["metrics"]["views"]}
-    chosen = _chosen(page.views, measured)
+    chosen = _chosen(views, measured)
     charts = [
-        line_chart(name, unit, [_line(part, key) for part in alike(history)], color)
+        line_chart(
+            name,
+            unit,
+            [[(h["seconds"], v) for h in part if (v := h.get(key)) is not None] for part in alike(history)],
+            color,
+        )
         for name, unit, key, color in CHARTS
     ]
     measured_some = [h["views"] for h in history if "views" in h]
     learned = [_learned(record) for record in report["learned"]]
-    diagnosis = page.diagnosis
     return filled(
         "report.html.j2",
         title=f"{report['scene']}, {report['method']}",
         verdict=told_verdict(report),
-        facts=_facts(report, page.scene),
+        facts=_facts(report, scene),
         report=report,
-        scene=None
-        if page.gaussians is None
-        else _scene(page.scene, page.gaussians, report["config"]["background"]),
+        scene=None if gaussians is None else _scene(scene, gaussians, report["config"]["background"]),
         splats=Markup(
             "\n".join((TEMPLATES / f"{name}.js").read_text("utf-8") for name in ("splat_shaders", "splats"))
         ),
         pairs=[pair(view, measured.get(view.name)) for view in chosen],
-        pairs_left=len(page.views) - len(chosen),
+        pairs_left=len(views) - len(chosen),
         charts=charts,
         measured_on=max(measured_some, default=0),
         parts=[] if diagnosis is None else diagnosis.parts,
@@ -177,7 +162,11 @@ def page_text(page: Page) -> str:
             for record, words in zip(report["learned"], learned, strict=True)
         ],
         learned_heads=["photo", *dict.fromkeys(head for words in learned for head in words)],
-        left_out=[_left_out(item) for item in report["left_out"] if not _correction(item)],
+        left_out=[
+            (item["what"], item["why"], item.get("evidence", ""))
+            for item in report["left_out"]
+            if not _correction(item)
+        ],
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],
         sure=_sure(report),
@@ -191,10 +180,6 @@ def _sure(report: Report) -> list[tuple[str, str]]:
     """How sure each photo's pose is, the loosest first."""
     sure = (report.get("sfm") or {}).get("sure_px") or {}
     return [(name, f"{px:.2f} px") for name, px in sorted(sure.items(), key=lambda item: -item[1])]
-
-
-def _line(history: Sequence[HistoryEntry], key: str) -> list[tuple[float, float]]:
-    return [(h["seconds"], value) for h in history if (value := h.get(key)) is not None]
 
 
 def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
@@ -318,10 +303,6 @@ def _plan_row(row: PlanRowRecord) -> tuple[str, ...]:
     """The cells of a decision."""
     when = f"after iteration {row['iteration']:,}: " if "iteration" in row else ""
     return row["what"], row["value"], when + row["why"], row.get("evidence", ""), row.get("rule", "")
-
-
-def _left_out(item: LeftOutRecord) -> tuple[str, ...]:
-    return item["what"], item["why"], item.get("evidence", "")
 
 
 def _correction(item: Mapping[str, Any]) -> bool:

@@ -14,7 +14,7 @@ from hqgs.model.formats.turned import matrices
 from hqgs.scene.paths import view_matrix
 from hqgs.scene.scene import Camera
 from hqgs.show.frames import Activated, depth_picture, depth_range, grey, trust_picture
-from hqgs.show.trust import LazyTrust
+from hqgs.show.trust import Trust
 
 STREAMED_SIDE = 2048  # px, at most
 MOVED = 0.02  # radians, and of the distance: a camera nearer than that to a photo's sees the same
@@ -51,10 +51,10 @@ class Pose:
         return Camera(width, height, K, view_matrix(self.R.T, self.position))
 
 
-def shown(scene: Activated, camera: Camera, show: str, trust: LazyTrust) -> Picture:
-    """The picture of a camera, [H, W, 3]: "color", "depth", "alpha" or "trust"."""
-    if show == "trust":
-        return trust_picture(trust.of(scene.gaussians).bound(camera))
+def shown(scene: Activated, camera: Camera, show: str, trust: Trust | None) -> Picture:
+    """The picture of a camera, [H, W, 3]: "color", "depth", "alpha", or that of `trust`, if there is any."""
+    if trust is not None:
+        return trust_picture(trust.bound(camera))
     if show == "color":
         return scene.color(camera)
     depth, alpha = scene.depth(camera)

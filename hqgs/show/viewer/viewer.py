@@ -26,7 +26,7 @@ from hqgs.scene.camera_files import KnownCamera, RunCameras, save_path
 from hqgs.scene.paths import UP, camera_path, focus
 from hqgs.scene.scene import Camera
 from hqgs.show.frames import Activated
-from hqgs.show.trust import LazyTrust
+from hqgs.show.trust import Trust, has_photos, trust_of
 from hqgs.show.viewer.guard import PORT, start_server
 from hqgs.show.viewer.measure import Ruler
 from hqgs.show.viewer.pictures import Pose, beside, same_view, shown
@@ -86,7 +86,7 @@ class Viewer:
         self._lock = threading.RLock()
         self._known, self._folder, self._source = known, folder, source or folder
         self._views: dict[str, KnownCamera] = {} if known is None else {v.name: v for v in known.views}
-        self._trust = LazyTrust(known)
+        self._trust: Trust | None = None  # learned when it is first asked for
         self._gaussians: Gaussians | None = None
         self._scene: Activated | None = None  # they, ready to be rendered
         self._reach = 1.0
@@ -114,7 +114,7 @@ class Viewer:
         first = self._scene is None
         scene = Activated(copy)
         with self._lock:
-            self._gaussians, self._scene = copy, scene
+            self._gaussians, self._scene, self._trust = copy, scene, None
             self.ruler.world = copy.world
             if first:
                 self._start_view(copy)
@@ -125,7 +125,8 @@ class Viewer:
 
     def offer_trust(self) -> None:
         """Let pages show it, of a scene that stays as it is, where the run has photos."""
-        if self._gaussians is not None and self._trust.possible(self._gaussians):
+        shown = self._gaussians
+        if shown is not None and (shown.errors is not None or has_photos(self._known)):
             self._show.options = (*self._show.options, "trust")
 
     def pump(self) -> bool:
@@ -159,7 +160,10 @@ class Viewer:
         camera = pose.camera(height)
         started = time.perf_counter()
         try:
-            picture = shown(self._scene, camera, self._show.value, self._trust)
+            asked = self._show.value == "trust"
+            if asked and self._trust is None:
+                self._trust = trust_of(self._scene.gaussians, self._known)
+            picture = shown(self._scene, camera, self._show.value, self._trust if asked else None)
             client.took(time.perf_counter() - started, camera.height, sharp)
             picture = self._compared(picture, camera)
         except ValueError:  # a camera that no scene can be seen from, such as 1e300 away
