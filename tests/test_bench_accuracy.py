@@ -17,7 +17,6 @@ from scenes import random_scene
 import hqgs
 from benchmarks import cli
 from benchmarks.accuracy import CASES, ORACLES, Knobs, TunedPass, errors_against
-from benchmarks.pages.figures import unbeaten
 from benchmarks.pages.sections import unbeaten_default
 from benchmarks.rows import Table
 from benchmarks.speed.inputs import make_inputs
@@ -175,12 +174,6 @@ def test_errors_of_a_hand_made_case() -> None:
     assert errors["gradients"]["all"]["cosine"] == pytest.approx(16 / 25)
 
 
-def test_pareto_front_of_a_hand_made_case() -> None:
-    times = [1.0, 2.0, 2.0, 3.0, 4.0, 0.5]
-    errors = [5.0, 3.0, 4.0, 3.0, 1.0, 9.0]
-    assert unbeaten(list(zip(times, errors, strict=True))) == [5, 0, 1, 4]
-
-
 def test_the_default_is_beaten_only_by_what_is_clearly_faster_and_nowhere_worse() -> None:
     def words(error: float, slowest: float, defined: float = 1.0) -> str:
         names = ("image_exact", "gradients_exact", "image_defined", "gradients_defined")
@@ -195,9 +188,3 @@ def test_the_default_is_beaten_only_by_what_is_clearly_faster_and_nowhere_worse(
     assert words(1.0, 1.1) == no  # within the noise
     assert words(1.1, 0.9) == no
     assert words(0.9, 0.9, defined=1.1) == no
-
-
-def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call("--quick", "--out", tmp_path, "--repeats", "0") == 2
-    assert "repeats is 0, wanted at least 1" in capsys.readouterr().err.splitlines()[-1]
-    assert not (tmp_path / "accuracy.csv").exists()

@@ -161,21 +161,3 @@ def test_the_command_keeps_finished_cases(
     assert call(*options, "--iterations", "41") == 0  # other settings are other runs
     assert "2 runs, 2 left" in capsys.readouterr().err
     assert table.rows()[0] == one
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--iterations", "0"], "iterations is 0, wanted at least 1"),
-        (["--downscale", "0.5"], "downscale must be at least 1, got 0.5"),
-        (["--downscale", "60"], "downscale must be in 1..47.25 for embedded, got 60"),
-        (["--rows", "none"], "rows: there is no 'none'; there are: as it is, "),
-        (["--seeds", "-1"], "seed is -1, wanted at least 0"),
-    ],
-)
-def test_bad_options_are_one_line_and_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    assert call("--quick", "--out", tmp_path, *arguments) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"hqgs: {message}")

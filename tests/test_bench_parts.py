@@ -213,24 +213,6 @@ def test_the_front_holds_what_no_other_beats_in_both() -> None:
     assert unbeaten([(size, -psnr) for size, psnr in pairs]) == [4, 5, 1, 0]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--downscale", "0.5"], "downscale must be at least 1, got 0.5"),
-        (["--scenes", "a", "b"], "one scene and one seed are written"),
-        (["--iterations", "0"], "iterations is 0, wanted at least 1"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: list[str],
-    message: str,
-) -> None:  # fmt: skip
-    monkeypatch.setattr(protocol, "embedded_scene", lambda *_, **__: tiny_scene())
-    assert call(*arguments, "--out", tmp_path) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert message in line
-
-
 # --- The benchmark `time`: runs that have seconds, and one that keeps its course
 
 
@@ -245,3 +227,35 @@ def test_a_quick_run_has_a_line_for_each_row(tmp_path: Path, capsys: pytest.Capt
     assert (timed["row"], timed["iterations"], timed["history"]) == ("0.5 s", 60, "")
     assert timed["trained"] > 0
     assert 0 < timed["haarpsi"] < 1
+
+
+# --- What all say of bad options
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("accuracy --quick --repeats 0", "repeats is 0, wanted at least 1"),
+        ("speed --quick --repeats 0", "repeats is 0, wanted at least 1"),
+        ("speed --quick --method 4dgs", "unknown method '4dgs'"),
+        ("speed --quick --threads 0", "threads"),
+        ("export --scenes a b", "one scene and one seed are written"),
+        ("export --iterations 0", "iterations is 0, wanted at least 1"),
+        ("endurance --quick --downscale 60", "downscale must be in 1..47.25 for embedded, got 60"),
+        ("endurance --quick --rows none", "rows: there is no 'none'; there are: as it is, "),
+        ("quality --quick --rows nerf", "rows: there is no 'nerf'; there are: 3dgs, srgs, hqgs"),
+        ("quality --quick --degradations fog", "unknown degradation 'fog'"),
+        ("quality --quick --degradations blur blur", "degradations holds blur twice"),
+        ("quality --quick --seeds -1", "seed is -1, wanted at least 0"),
+        ("quality --quick --downscale 0.5", "downscale must be at least 1, got 0.5"),
+        ("quality --quick --pictures -1", "pictures is -1"),
+        ("quality --quick --scenes no", "there is no scene folder"),
+    ],
+)
+def test_bad_options_are_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: str, message: str
+) -> None:
+    assert cli.main([*arguments.split(), "--out", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"hqgs: {message}")
+    assert not list(tmp_path.glob("*.csv"))

@@ -369,19 +369,7 @@ def test_protocols() -> None:
             assert cell.config == config
 
 
-def test_bad_options_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for options, message in (
-        (["--rows", "nerf"], "rows: there is no 'nerf'; there are: 3dgs, srgs, hqgs"),
-        (["--degradations", "fog"], "unknown degradation 'fog'"),
-        (["--degradations", "blur", "blur"], "degradations holds blur twice"),
-        (["--seeds", "-1"], "seed is -1"),
-        (["--iterations", "0"], "iterations is 0"),
-        (["--downscale", "0.5"], "downscale must be at least 1, got 0.5"),
-        (["--pictures", "-1"], "pictures is -1"),
-        (["--scenes", str(tmp_path / "no")], "there is no scene folder"),
-    ):
-        assert call(tmp_path / "out", *options) == 2
-        assert message in capsys.readouterr().err
+def test_scenes_that_tables_could_not_tell_apart_are_refused(tmp_path: Path) -> None:
     tiny = Protocol(rows=(), iterations=1, downscale=1.0, embedded=(48, 36, 10))
     with pytest.raises(ValueError, match="two scenes are called 'fern'"):
         load_scenes([tmp_path / "a" / "fern", tmp_path / "b" / "fern"], tiny, tmp_path, False)

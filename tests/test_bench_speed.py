@@ -111,22 +111,6 @@ def test_parts_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "| Gaussians | project | bin and composite |" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--repeats", "0"], "repeats is 0, wanted at least 1"),
-        (["--method", "4dgs"], "unknown method '4dgs'"),
-        (["--threads", "0"], "threads"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    assert call("--quick", "--out", tmp_path, *arguments) == 2
-    assert message in capsys.readouterr().err.splitlines()[-1]
-    assert not (tmp_path / "speed.csv").exists()
-
-
 @pytest.mark.parametrize(("n", "width", "height"), [(300, 80, 60), (2_000, 80, 60), (4_000, 252, 189)])
 def test_blended_gaussians_are_those_with_a_colour_gradient(
     n: int, width: int, height: int, monkeypatch: pytest.MonkeyPatch
