@@ -109,7 +109,12 @@ def test_plan_judge_and_info_say_what_was_done_with_poses_and_masks(
         assert told.count("poses are read as camera to world") == 1
         assert told.count("9 of 9 photos have a mask") == 1
     assert main(["info", str(root)]) == 0
-    assert "masks: of 9 photos" in capsys.readouterr().out
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.count("poses are read as camera to world") == 1
+    assert told.count("9 of 9 photos have a mask") == 1
+    behind = replace(truth, points=truth.points - np.array([0, 0, 500.0]))
+    assert main(["info", str(written(behind, tmp_path / "behind"))]) == 0
+    assert "hqgs train refuses it: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

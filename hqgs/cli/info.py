@@ -106,7 +106,6 @@ def _told(run: RunFolder, report: Any) -> list[str]:
 
 def _photos(path: Path) -> list[str]:
     from hqgs.model.formats.files import FORMATS  # here: they load torch
-    from hqgs.scene.checks import beside
     from hqgs.scene.load import formats_of, scene_folder
     from hqgs.scene.masks import masks_of
     from hqgs.scene.sfm.bare_photos import bare_photos, readable
@@ -128,9 +127,24 @@ def _photos(path: Path) -> list[str]:
         f"{sum(exif.quarter_turns > 0 for exif in photos.exif)} of them",
         f"poses: {poses}",
     ]
-    others = beside(root, photos.folder) if formats else []  # they are read
-    lines += [*inside, *(note for note in photos.notes if note not in others)]
-    if count := len(masks_of(root, photos.folder, photos.names)):
-        lines.append(f"masks: of {count} photos")
+    lines += inside
+    if formats:
+        lines += _as_read(root)
+    else:
+        lines += photos.notes
+        if count := len(masks_of(root, photos.folder, photos.names)):
+            lines.append(f"masks: of {count} photos")
     lines += [f"cannot be read: {name} ({why})" for name, why in photos.unreadable.items()]
     return lines
+
+
+def _as_read(root: Path) -> list[str]:
+    """What was done with photos, poses and points of a folder that has them, or why it is refused."""
+    from hqgs.scene.load import load_scene
+    from hqgs.training.config import STANDARD, longest_side
+
+    try:
+        scene = load_scene(root, test_every=0, longest=longest_side(STANDARD, None))
+        return [f"read: {note}" for note in scene.notes]
+    except (OSError, ValueError) as error:
+        return [f"hqgs train refuses it: {error}"]
