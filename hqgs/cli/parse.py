@@ -67,7 +67,10 @@ def parse(options: type[T], command: str, about: str, arguments: Sequence[str]) 
 def _sentence(box: str) -> str:
     """What tyro draws as a box, as one line without the options' help."""
     kept = []
-    for line in (line.strip("│╭╮╰╯─ \n").rstrip() for line in _shallow(box)):
+    for line in (line.strip("│") for line in box.splitlines()[1:]):
+        if len(line) - len(line.lstrip()) >= DEEP:  # it explains an option
+            continue
+        line = line.strip("│╭╮╰╯─ \n").rstrip()
         if line.startswith(("Got errors", "Argument helptext")):
             break
         if line.strip("-") and not line.startswith(("For full helptext", "hqgs ")):
@@ -76,9 +79,3 @@ def _sentence(box: str) -> str:
     for said, meant in WORDS.items():
         text = re.sub(said, meant, text)
     return text
-
-
-def _shallow(box: str) -> list[str]:
-    """The lines inside a box, but for those far from its border, which explain an option."""
-    lines = [line.strip("│") for line in box.splitlines()[1:]]
-    return [line for line in lines if len(line) - len(line.lstrip()) < DEEP]

@@ -120,7 +120,9 @@ def difference_row(found: dict[str, Any], shown: Sequence[str]) -> list[str]:
             cells.append("-")
             continue
         text = with_half(apart["mean"], apart["interval"], "+" + FORMS[name])
-        cells.append(f"{text} ({word_for(name, apart)})")
+        better = (apart["mean"] > 0) != (name in ("lpips", "lpips_vgg"))
+        word = "not significant" if not apart["sure"] else "better" if better else "worse"
+        cells.append(f"{text} ({word})")
     return ["difference", *cells]
 
 
@@ -156,14 +158,6 @@ def _cells(of: dict[str, Any], shown: Sequence[str]) -> list[str]:
         "-" if of["mean"][name] is None else with_half(of["mean"][name], of["interval"][name], FORMS[name])
         for name in shown
     ]
-
-
-def word_for(metric: str, apart: dict[str, Any]) -> str:
-    """Whether a difference is one: better, worse, or within its interval."""
-    if not apart["sure"]:
-        return "not significant"
-    less_is_better = metric in ("lpips", "lpips_vgg")
-    return "better" if (apart["mean"] > 0) != less_is_better else "worse"
 
 
 _LEVELS = (

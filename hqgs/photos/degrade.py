@@ -104,11 +104,6 @@ class _Photo:
         return Degraded(self.now, None, self.jpeg, self.records)
 
 
-def add_noise(image: Float32, sigma: float, rng: np.random.Generator) -> Float32:
-    """Add N(0, sigma / 255) to every value, independently; neither clipped nor rounded to 8 bits."""
-    return image + np.float32(sigma / 255) * rng.standard_normal(image.shape, np.float32)
-
-
 def shrink(image: Float32, factor: int) -> Float32:
     """The photo [H, W, 3] at [ceil(H / factor), ceil(W / factor), 3] by antialiased bicubic resizing.
 
@@ -153,8 +148,9 @@ def convolve(image: Float32, kernel: NDArray[np.float64]) -> Float32:
 Own = tuple[Float32, Record]  # the photo, and what its record gets
 
 
-def _plain(operator: Callable[[Float32, float, np.random.Generator], Float32]) -> Callable[..., Own]:
-    return lambda image, value, rng: (operator(image, value, rng), {})
+def _noise(image: Float32, sigma: float, rng: np.random.Generator) -> Own:
+    """N(0, sigma / 255) is added to every value, independently; neither clipped nor rounded to 8 bits."""
+    return image + np.float32(sigma / 255) * rng.standard_normal(image.shape, np.float32), {}
 
 
 def _motion(image: Float32, length: float, rng: np.random.Generator) -> Own:
@@ -163,9 +159,9 @@ def _motion(image: Float32, length: float, rng: np.random.Generator) -> Own:
 
 
 OPERATORS: dict[str, Callable[[Float32, float, np.random.Generator], Own]] = {
-    "noise": _plain(add_noise),
-    "blur": _plain(lambda image, sigma, rng: gaussian_blur(image, sigma)),
-    "defocus": _plain(lambda image, radius, rng: convolve(image, disc_kernel(radius))),
+    "noise": _noise,
+    "blur": lambda image, sigma, rng: (gaussian_blur(image, sigma), {}),
+    "defocus": lambda image, radius, rng: (convolve(image, disc_kernel(radius)), {}),
     "motion": _motion,
 }  # by the kind: of a photo, the value and the photo's generator
 FILES: dict[str, Callable[[Float32, float, np.random.Generator], tuple[bytes, Record]]] = {

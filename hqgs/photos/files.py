@@ -255,7 +255,10 @@ def decode_mask(
         width, height = height, width
     try:
         with open_photo(path) as file:
-            lossy = file.format in _LOSSY or (file.format == "WEBP" and _is_lossy_webp(path))
+            lossy = file.format in _LOSSY
+            if file.format == "WEBP":  # lossy where it has no picture that is stored exactly
+                with path.open("rb") as raw:
+                    lossy = b"VP8L" not in raw.read(1 << 16)
             pixels = np.asarray(file.convert("RGB") if file.mode in _NOT_RGB else file)
     except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the mask {path}: {e}") from e
@@ -269,9 +272,3 @@ def decode_mask(
     rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64)
     columns = ((np.arange(width) + 0.5) * w / width).astype(np.int64)
     return oriented(counts[rows][:, columns], {6: 8, 8: 6}.get(orientation, orientation) if shown else 1)
-
-
-def _is_lossy_webp(path: Path) -> bool:
-    """Whether a WebP file has no picture that is stored exactly."""
-    with path.open("rb") as file:
-        return b"VP8L" not in file.read(1 << 16)

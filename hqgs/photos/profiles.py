@@ -73,7 +73,8 @@ def colors_of(photo: Image.Image, path: Path) -> Colors | None:
     if profile := codes or info.get("icc_profile", b""):
         mode, name, same = _looked_into(profile)
         own = photo.mode if photo.mode in ("LAB", "CMYK") else "RGB"
-        if mode and (mode not in (own, "L") or (mode == "L" and not _is_grey(photo))):
+        grey = photo.mode in ("1", "L", "LA", "La") or photo.mode.startswith("I")
+        if mode and (mode not in (own, "L") or (mode == "L" and not grey)):
             return Colors(f"a profile of another kind of pixels ({name})")
         return None if same else Colors(name, profile if mode else b"")
     if profile is None:  # Pillow found one that it could not unpack
@@ -212,10 +213,6 @@ def _made(name: str, points: tuple[float, ...], curve: tuple[float, ...]) -> Col
     profile = head.ljust(128, b"\0") + struct.pack(">I", len(tags)) + table + body
     mode, _, same = _looked_into(profile)
     return None if same else Colors(name, profile) if mode else Colors(f"{name}, which are none")
-
-
-def _is_grey(photo: Image.Image) -> bool:
-    return photo.mode in ("1", "L", "LA", "La") or photo.mode.startswith("I")
 
 
 def _of_png(path: Path) -> tuple[int, int] | None:

@@ -39,10 +39,9 @@ def listed_split(folders: Sequence[Path], root: Path) -> Split | None:
     """
     for folder in dict.fromkeys(folders):
         for name in LISTS:
-            if (path := folder / name).is_file():
-                split = _from_json(path, path.relative_to(root).as_posix())
-                if split is not None:
-                    return split
+            meta = read_json(path) if (path := folder / name).is_file() else None
+            if isinstance(meta, dict) and (split := lists_in(meta, path.relative_to(root).as_posix())):
+                return split
         found = {key: folder / f"{key}.txt" for key in (TRAIN, TEST, VAL)}
         lists = {key: _lines(path) for key, path in found.items() if path.is_file()}
         if TEST in lists or VAL in lists:
@@ -132,8 +131,3 @@ def _lines(path: Path) -> list[str]:
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not a list of names: {error}") from error
     return [line.strip().replace("\\", "/") for line in text.splitlines() if line.strip()]
-
-
-def _from_json(path: Path, source: str) -> Split | None:
-    meta = read_json(path)
-    return lists_in(meta, source) if isinstance(meta, dict) else None

@@ -100,11 +100,12 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> tuple[Gaus
         g = g.like(g.named() | {"shN": g.shN[:, : (degree + 1) ** 2 - 1]})
         left_out.append(LeftOut(f"harmonics of {bands}", why, evidence))
     if options.format == "spz":  # zeros save nothing in the others, and in SOG little: 4 % of a file for 6 dB
-        fewer = _without_bands(g, degrees)
-        if changed := int((fewer.shN != g.shN).flatten(1).any(dim=1).sum()):
+        keep = torch.arange(g.shN.shape[1]) < ((degrees + 1).square() - 1)[:, None]
+        fewer = g.shN * keep[:, :, None]
+        if changed := int((fewer != g.shN).flatten(1).any(dim=1).sum()):
             why = f"they change colours by at most {options.band_tolerance:g}"
             left_out.append(LeftOut(f"the highest harmonics of {changed:,} Gaussians", why))
-            g = fewer
+            g = g.like(g.named() | {"shN": fewer})
     return g, left_out
 
 
@@ -136,13 +137,6 @@ def along_a_curve(gaussians: Gaussians) -> Gaussians:
     """The Gaussians along a Morton curve: neighbours in the file are neighbours in space, and pack better."""
     order = curve_order(gaussians.means.detach().numpy())
     return gaussians.rows(torch.from_numpy(order))
-
-
-def _without_bands(gaussians: Gaussians, degrees: Tensor) -> Gaussians:
-    """With zeros for the coefficients above each Gaussian's degree."""
-    places = torch.arange(gaussians.shN.shape[1])
-    keep = places < ((degrees + 1).square() - 1)[:, None]
-    return gaussians.like(gaussians.named() | {"shN": gaussians.shN * keep[:, :, None]})
 
 
 def _write(gaussians: Gaussians, path: Path, options: ExportOptions) -> dict[str, int]:

@@ -103,8 +103,9 @@ def gradients_of_several(
 
 
 def to_rasterize(trained: Gaussians, modulated: Gaussians) -> Gaussians:
-    """`modulated`, with harmonics that get no gradient where it follows from sh0's."""
-    return replace(modulated, shN=modulated.shN.detach()) if _follows(trained, modulated) else modulated
+    """`modulated`, with harmonics that get no gradient where theirs is a product of the basis and sh0's."""
+    follows = modulated.sh0 is trained.sh0 and modulated.shN is trained.shN
+    return replace(modulated, shN=modulated.shN.detach()) if follows else modulated
 
 
 def part_of(forward: ForwardPass, fault: Fault | None, trained: Gaussians, optimizer: Adam) -> Part:
@@ -211,8 +212,3 @@ def _own(optimizer: Adam) -> dict[str, Tensor]:
     """The method's trained tensors."""
     groups = [group for group in optimizer.param_groups if group.get("own")]
     return {f"{group['name']}.{k}": param for group in groups for k, param in enumerate(group["params"])}
-
-
-def _follows(trained: Gaussians, modulated: Gaussians) -> bool:
-    """Whether the gradient of the higher harmonics is a product of the basis and of sh0's gradient."""
-    return modulated.sh0 is trained.sh0 and modulated.shN is trained.shN

@@ -40,7 +40,7 @@ def save_checkpoint(path: str | Path, tensors: dict[str, Tensor], meta: dict[str
     path = Path(path)
     contiguous = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
     text = json.dumps(meta, allow_nan=False)
-    header = {"format": str(FORMAT), "meta": text, "crc32": str(_crc32(text, contiguous))}
+    header = {"format": str(FORMAT), "meta": text, "crc32": str(checksum(contiguous, text))}
     try:
         with atomic_path(path) as tmp:
             save_file(contiguous, tmp, metadata=header)
@@ -68,7 +68,7 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]
         raise ValueError(
             f"{path} is not a checkpoint of this version: format {header.get('format')}, wanted {FORMAT}"
         )
-    if header.get("crc32") != str(_crc32(header["meta"], tensors)):
+    if header.get("crc32") != str(checksum(tensors, header["meta"])):
         raise ValueError(f"the checkpoint {path} is damaged: its checksum does not match")
     try:
         meta = json.loads(header["meta"])
@@ -113,11 +113,6 @@ def check_same(
                 f"{path} was made with another {prefix}{name}: {old!r} there, {new!r} in this run; "
                 "use the same one, or another folder"
             )
-
-
-def other_length(saved: dict[str, Any], here: dict[str, Any]) -> bool:
-    """Whether another length is asked for."""
-    return any(saved.get(name) != here.get(name) for name in ("iterations", "leave_out", "seconds"))
 
 
 def freed(saved: dict[str, Any], here: dict[str, Any]) -> list[str]:
@@ -165,16 +160,11 @@ def scene_fingerprint(scene: Scene) -> dict[str, str]:
     }
 
 
-def checksum(tensors: dict[str, Tensor]) -> int:
-    """Of each tensor's name, type, shape and bytes."""
-    return _crc32("", {name: tensor.detach().contiguous() for name, tensor in tensors.items()})
-
-
-def _crc32(text: str, tensors: dict[str, Tensor]) -> int:
-    """Checksum of the JSON text and of each tensor's name, type, shape and bytes."""
+def checksum(tensors: dict[str, Tensor], text: str = "") -> int:
+    """Of a text and of each tensor's name, type, shape and bytes."""
     crc = zlib.crc32(text.encode())
     for name in sorted(tensors):
-        tensor = tensors[name]
+        tensor = tensors[name].detach().contiguous()
         crc = zlib.crc32(f"{name} {tensor.dtype} {list(tensor.shape)}".encode(), crc)
         crc = zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, crc)
     return crc

@@ -20,7 +20,7 @@ from hqgs.training.forward import TrainingViews
 from hqgs.training.frame import Frame, Trainable, with_rounded_poses
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
-from hqgs.training.plan import Facts, RunPlan, StepSeconds, Tried
+from hqgs.training.plan import Facts, RunPlan, StepSeconds
 from hqgs.training.rules import OF_PHOTOS_ALONE, RULES, growth_in_doubt, plan_run
 from hqgs.training.trial import Begin, calls_for_trial, tried_growth, tried_looks
 
@@ -82,24 +82,16 @@ class Prepared:
         if plan.first_points > facts.points and self.scene.seen is not None:
             facts = replace(facts, agreed=self._first_points(plan.first_points, plan.found_back)[2])
             plan = plan_run(facts, self.diagnosis, self.asked)
-        if self._wants_trial(facts, plan):
-            facts = replace(facts, tried=self._tried(plan))
+        timed = self.asked.seconds is None or seconds is not None  # the length of the run is known
+        in_doubt = "growth" in self.asked.leave_out and timed and growth_in_doubt(facts, plan)
+        if self._begin is not None and in_doubt and calls_for_trial(self.scene, plan):
+            if not self._has_tried:  # once for a run
+                self._has_tried = True
+                tried = tried_growth(self.scene, plan, self._begin, self._on_stage)
+                self.facts = replace(self.facts, tried=tried)
+            facts = replace(facts, tried=self.facts.tried)
             plan = plan_run(facts, self.diagnosis, self.asked)
         return plan
-
-    def _wants_trial(self, facts: Facts, plan: RunPlan) -> bool:
-        """Whether a trial is to tell if growth pays; not before the run's length is known."""
-        timed = self.asked.seconds is None or facts.seconds is not None
-        can = self._begin is not None and "growth" in self.asked.leave_out and timed
-        return can and growth_in_doubt(facts, plan) and calls_for_trial(self.scene, plan)
-
-    def _tried(self, plan: RunPlan) -> Tried | None:
-        """What the trial of growth told, once for a run."""
-        if self._begin is not None and not self._has_tried:
-            self._has_tried = True
-            tried = tried_growth(self.scene, plan, self._begin, self._on_stage)
-            self.facts = replace(self.facts, tried=tried)
-        return self.facts.tried
 
     def first_gaussians(self, plan: RunPlan) -> Gaussians:
         """Those that a run of this plan trains."""

@@ -259,7 +259,9 @@ class Trainer:
             done, decisions = meta["iteration"], meta["decisions"]
             ended = done == decisions["length"] and self.asked.seconds is None
             more = self.plan.settings.iterations
-            longer = ended and checkpoint.other_length(meta["asked"], asked) and more > done
+            lengths = ("iterations", "leave_out", "seconds")
+            other = any(meta["asked"].get(name) != asked.get(name) for name in lengths)
+            longer = ended and other and more > done
             checkpoint.check_same(path, "", meta["asked"], asked, longer)
             if tried := meta.get("tried"):
                 self.prepared.facts = replace(self.prepared.facts, tried=Tried(**tried))

@@ -164,7 +164,9 @@ def _as_stored(
     opacities: NDArray[Any], scales: NDArray[Any], notes: list[str]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Logits and logarithms, of values of another program that may be neither; `notes` tell."""
-    if not _are_shares(opacities):
+    # A hundred and more logits of a trained scene do not stay in 0..1.
+    low, high = (opacities.min(), opacities.max()) if len(opacities) >= 100 else (0.5, 0.5)
+    if not (low >= 0 and high <= 1 and low < 0.3 and high > 0.9):
         return opacities, scales
     notes.append("its opacities are between 0 and 1: they were read as they are, not as logits")
     if (scales > 0).all():
@@ -197,12 +199,6 @@ def _check_columns(present: set[str], wanted: list[str]) -> None:
     rest = sum(name.startswith("f_rest_") for name in wanted)
     if rest not in [*_REST_COUNTS, _REST_4]:
         raise ValueError(f"{rest} f_rest_* properties, wanted one of {_REST_COUNTS}")
-
-
-def _are_shares(opacities: NDArray[np.float32]) -> bool:
-    """Whether a hundred and more opacities are no logits: those of a trained scene do not stay in 0..1."""
-    low, high = (opacities.min(), opacities.max()) if len(opacities) >= 100 else (0.5, 0.5)
-    return bool(low >= 0 and high <= 1 and low < 0.3 and high > 0.9)
 
 
 def _plain_colors(vertices: NDArray[Any]) -> NDArray[np.float64]:

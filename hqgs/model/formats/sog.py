@@ -117,11 +117,13 @@ def encode_sog(g: Arrays, antialiased: bool) -> dict[str, bytes]:
     fixed = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.int64)
     scales, colors = codebook(g["scales"]), codebook(g["sh0"][:, 0])
     opacities = np.rint(255 * to_opacities(g["opacities"]))[:, None]
+    place, three = smallest_three(g["quats"].astype(np.float64))
+    three = np.rint((three / np.sqrt(2) + 0.5) * 255)
     files = {
         "means_l.webp": _webp(fixed % 256),
         "means_u.webp": _webp(fixed // 256),
         "scales.webp": _webp(scales[1]),
-        "quats.webp": _webp(_smallest_three(g["quats"].astype(np.float64))),
+        "quats.webp": _webp(np.concatenate([three, LARGEST + place[:, None]], axis=1)),
         "sh0.webp": _webp(np.concatenate([colors[1], opacities], axis=1)),
     }
     meta: dict[str, Any] = {"version": 2, "count": n, "antialias": antialiased}
@@ -141,13 +143,6 @@ def encode_sog(g: Arrays, antialiased: bool) -> dict[str, bytes]:
         meta["shN"]["codebook"] = book.tolist()
         meta["shN"]["files"] = ["shN_centroids.webp", "shN_labels.webp"]
     return {META: json.dumps(meta).encode()} | files
-
-
-def _smallest_three(quats: Array) -> Array:
-    """Three components in 8 bits each, and in the fourth byte which one, the largest, is not among them."""
-    place, three = smallest_three(quats)
-    three = np.rint((three / np.sqrt(2) + 0.5) * 255)
-    return np.concatenate([three, LARGEST + place[:, None].astype(np.float64)], axis=1)
 
 
 def _webp(values: NDArray[Any], across: int = 0) -> bytes:

@@ -300,27 +300,14 @@ def find_formation(scene: Scene, text: str, inspector: Inspector) -> Formation:
     """The formation that `text` names, with "auto" the diagnosed one."""
     degradation = parse_formation(inspector.diagnose(scene).formation if text == AUTO else text)
     kinds = {step.kind for step in degradation.steps}
-    directions = _motion_directions(scene, inspector) if "motion" in kinds else {}
-    noises = _noises(scene, inspector) if "grain" in kinds else {}
+    directions, noises = dict[str, float](), dict[str, float]()  # of photos that tell one
+    if kinds & {"motion", "grain"}:
+        for photo in inspector.diagnose(scene, max_photos=len(scene.train)).photos:
+            if "motion" in kinds and photo.blur is not None and photo.blur.direction is not None:
+                directions[photo.name] = math.radians(photo.blur.direction)
+            if "grain" in kinds and photo.told_noise is not None:
+                noises[photo.name] = photo.told_noise / 255
     return Formation(degradation, directions, noises)
-
-
-def _motion_directions(scene: Scene, inspector: Inspector) -> dict[str, float]:
-    """Radians by photo, for those that tell one."""
-    return {
-        photo.name: math.radians(photo.blur.direction)
-        for photo in inspector.diagnose(scene, max_photos=len(scene.train)).photos
-        if photo.blur is not None and photo.blur.direction is not None
-    }
-
-
-def _noises(scene: Scene, inspector: Inspector) -> dict[str, float]:
-    """Standard deviations by photo, where 1 is white, of those whose noise is told from texture."""
-    return {
-        photo.name: noise / 255
-        for photo in inspector.diagnose(scene, max_photos=len(scene.train)).photos
-        if (noise := photo.told_noise) is not None
-    }
 
 
 def _photo(view: View, factor: int) -> NDArray[np.uint8] | NDArray[np.float32]:
