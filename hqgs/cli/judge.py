@@ -17,7 +17,7 @@ from hqgs.cli.scenes import MeasuredOptions, check_background, check_out_folder,
 from hqgs.evaluation.verdict import judged_by, judgement
 
 if TYPE_CHECKING:
-    from hqgs.evaluation.judge import Judged
+    from hqgs.evaluation.held_out import HeldOutViews
     from hqgs.scene.scene import Scene, View
 
 NUMBERS, PAGE = "judge.json", "judge.html"
@@ -77,9 +77,9 @@ def run(options: Judge) -> int:
             for file in [source, other]
             if file is not None
         ]
-    found: dict[str, Any] = {"hqgs": __version__, "protocol": protocol, "scene": judged[0].json()}
+    found: dict[str, Any] = {"hqgs": __version__, "protocol": protocol, "scene": judged[0][0]}
     if known is not None or other is not None:
-        found["against"] = known["scene"] if known is not None else judged[1].json()
+        found["against"] = known["scene"] if known is not None else judged[1][0]
         found["difference"] = compared(found["scene"], found["against"])
     psnr, name = judged_by({**(run.report or {}), "metrics": {"mean": found["scene"]["mean"]}})
     found["judged_by"] = {"psnr": psnr, "name": name}
@@ -87,7 +87,7 @@ def run(options: Judge) -> int:
         from hqgs.show.page.judge_page import judge_page
 
         write_json(options.out / NUMBERS, found)
-        write_text(options.out / PAGE, judge_page(found, judged))
+        write_text(options.out / PAGE, judge_page(found, judged[0][1]))
     print(judgement(found))
     if options.out is not None:
         print(f"\n{options.out / PAGE}: photos beside renders, and where the errors are")
@@ -116,7 +116,7 @@ def judge_file(
     background: tuple[float, float, float],
     screen: LoadingScreen,
     fit: bool = False,
-) -> Judged:
+) -> tuple[dict[str, Any], HeldOutViews]:
     """A scene file, measured; what its reading left out is told."""
     from hqgs.evaluation.judge import judge
     from hqgs.evaluation.looks import looks_beside

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from statistics import median
 from typing import Any
 
@@ -18,7 +18,7 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.causes import Causes, causes, noise_of, pixel_maps, shares, shown_by
 from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.evaluation.fit_cameras import Fitted, fit_cameras
-from hqgs.evaluation.held_out import HeldOutViews, RenderedView, held_out_renders, measured
+from hqgs.evaluation.held_out import HeldOutViews, held_out_renders, measured
 from hqgs.evaluation.intervals import difference, half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
 from hqgs.model.gaussians import Gaussians
@@ -31,55 +31,6 @@ from hqgs.scene.scene import Scene, View
 Background = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Judged:
-    """A scene on photos."""
-
-    name: str  # of the scene file
-    bytes: int
-    gaussians: int
-    sh_degree: int
-    antialiased: bool
-    views: Sequence[RenderedView] = field(repr=False)  # rendered when they are asked for
-    each: list[ViewMetrics]
-    fits: list[Fitted]  # empty where cameras were not fitted
-    again: list[ViewMetrics]  # with fitted cameras
-    causes: list[Causes | None]  # of each photo, None: its mask leaves no pixel
-    render_seconds: float  # of a photo, median, on all threads
-    worse_than_flat: int  # photos to which one colour, their mean, is nearer than the render
-
-    @property
-    def names(self) -> list[str]:
-        """Of the photos."""
-        return [view.name for view in self.views]
-
-    @property
-    def mean(self) -> ViewMetrics:
-        """Over the photos."""
-        return mean_metrics(self.each)
-
-    def json(self) -> dict[str, Any]:
-        """What the JSON file holds of it."""
-        known: dict[str, Any] = {
-            "name": self.name,
-            "bytes": self.bytes,
-            "gaussians": self.gaussians,
-            "sh_degree": self.sh_degree,
-            "antialiased": self.antialiased,
-            "worse_than_flat": self.worse_than_flat,
-            "render_seconds": self.render_seconds,
-            "threads": get_num_threads(),
-            **numbers(self.names, self.each),
-        }
-        if self.fits:
-            moved = [{"rotation_deg": fit.rotation_deg, "moved_px": fit.pixels} for fit in self.fits]
-            known["fitted"] = numbers(self.names, self.again, moved)
-        known["causes"] = shares([one for one in self.causes if one is not None])
-        for name, one in zip(self.names, self.causes, strict=True):
-            known["views"][name]["causes"] = one
-        return known
-
-
 def judge(
     name: str,
     size: int,
@@ -90,8 +41,10 @@ def judge(
     fit: bool = False,
     on_stage: OnStage = silent,
     looks: Mapping[str, Look] | None = None,
-) -> Judged:
+) -> tuple[dict[str, Any], HeldOutViews]:
     """Measure Gaussians, held in the frame of the scene's cameras, on some of its photos.
+
+    Returns what judge.json holds of them, and their views, which are rendered when they are asked for.
 
     Args:
         name, size: of the scene file; bytes.
@@ -127,28 +80,34 @@ def judge(
     fitted = held_out_renders(
         replace(scene, test=[one.view for one in fits]), gaussians, background=background, looks=looks
     )
-    found, seconds = list[Causes | None](), list[float]()
+    sorted_errors, seconds = list[Causes | None](), list[float]()  # None: the mask leaves no pixel
     shown = shown_by(gaussians, [view.camera for view in scene.train])
     for k, view in enumerate(views):
         seconds.append(_seconds(gaussians, view, background))
-        found.append(_causes(renders, fitted, k, gaussians, view, shown))
+        sorted_errors.append(_causes(renders, fitted, k, gaussians, view, shown))
         on_stage(Stage("errors sorted by their causes", k + 1, len(views)))
-    return Judged(
-        name=name,
-        bytes=size,
-        gaussians=len(gaussians),
-        sh_degree=gaussians.sh_degree,
-        antialiased=gaussians.antialiased,
-        views=renders,
-        each=each,
-        fits=fits,
-        again=measured(fitted),
-        causes=found,
-        render_seconds=median(seconds),
-        worse_than_flat=sum(
-            one.psnr is not None and flat_psnr(view) > one.psnr for view, one in zip(views, each, strict=True)
+    flats = [flat_psnr(view) for view in views]  # of one colour, the mean of the photo
+    names = renders.names
+    known: dict[str, Any] = {
+        "name": name,
+        "bytes": size,
+        "gaussians": len(gaussians),
+        "sh_degree": gaussians.sh_degree,
+        "antialiased": gaussians.antialiased,
+        "worse_than_flat": sum(
+            one.psnr is not None and flat > one.psnr for flat, one in zip(flats, each, strict=True)
         ),
-    )
+        "render_seconds": median(seconds),  # of a photo, on all threads
+        "threads": get_num_threads(),
+        **numbers(names, each),
+    }
+    if fits:
+        moved = [{"rotation_deg": fit.rotation_deg, "moved_px": fit.pixels} for fit in fits]
+        known["fitted"] = numbers(names, measured(fitted), moved)
+    known["causes"] = shares([one for one in sorted_errors if one is not None])
+    for of, one in zip(names, sorted_errors, strict=True):
+        known["views"][of]["causes"] = one
+    return known, renders
 
 
 def numbers(
@@ -172,7 +131,7 @@ def numbers(
 
 
 def compared(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
-    """Each metric of one scene less that of another on the same photos, both of `Judged.json`."""
+    """Each metric of one scene less that of another on the same photos, both as `judge` has them."""
     found: dict[str, Any] = {}
     for metric in METRICS:
         values = [[view[metric] for view in of["views"].values()] for of in (one, other)]

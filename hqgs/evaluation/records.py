@@ -19,6 +19,11 @@ Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | Non
 # (`Guard`), a process (`Ranks.record`), a decision (`PlanRow`), the frame (`World`, but for its place).
 PhotoRecord: TypeAlias = dict[str, Any]
 LearnedRecord = RankRecord = PlanRowRecord = WorldRecord = GuardEvent = GuardRecord = PhotoRecord
+# `ViewMetrics`, but for its reasons: of a view, or means. None: the report's `reasons` say why there is none.
+MetricValues: TypeAlias = dict[str, float | None]
+# The same of a held-out view, with its `name` and its `picture`: photo, render and difference, a file in the
+# folder of the run; None: nothing was written.
+ViewMetricValues: TypeAlias = dict[str, Any]
 
 
 class HistoryEntry(TypedDict):
@@ -39,25 +44,6 @@ def alike(history: Sequence[HistoryEntry]) -> list[list[HistoryEntry]]:
     Their means are not of the same photos there, so that no line leads from one to the other.
     """
     return [list(part) for _, part in groupby(history, lambda entry: entry.get("views"))]
-
-
-class MetricValues(TypedDict):
-    """The metrics of one view, or their means. None: the report's `reasons` say why there is none."""
-
-    psnr: float | None  # dB, up
-    ssim: float | None  # up
-    haarpsi: float | None  # up
-    lpips: float | None  # AlexNet, down
-    lpips_vgg: float | None  # VGG-16, down
-    psnr_aligned: float | None  # dB, up; brightness and tint of each photo set aside
-
-
-class ViewMetricValues(MetricValues):
-    """The metrics of a held-out view."""
-
-    name: str
-    psnr_shown: NotRequired[float]  # dB; as the scene is shown, where the others are in its camera's look
-    picture: str | None  # photo, render, difference: a file in the run's folder; None: nothing was written
 
 
 class MetricsRecord(TypedDict):

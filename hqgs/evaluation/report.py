@@ -8,7 +8,6 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from PIL import Image
@@ -86,7 +85,7 @@ def _report(
     mean = mean_metrics(metrics)
     measured: MetricsRecord = {
         "mean": _values(mean),
-        "interval": cast(MetricValues, half_widths([vars(m) for m in metrics], METRICS)),
+        "interval": half_widths([vars(m) for m in metrics], METRICS),
         "confidence": CONFIDENCE,
         "views": [
             {"name": name, **_values(m), "picture": picture}
@@ -110,7 +109,7 @@ def _check(record: RunRecord) -> None:
 
 
 def _values(metrics: ViewMetrics) -> MetricValues:
-    return cast(MetricValues, {metric: getattr(metrics, metric) for metric in METRICS})
+    return {metric: getattr(metrics, metric) for metric in METRICS}
 
 
 def _file_names(views: list[str]) -> list[str]:

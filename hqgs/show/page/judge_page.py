@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.evaluation.constants import PATCH, SHEET_PHOTOS
-from hqgs.evaluation.judge import Judged
+from hqgs.evaluation.held_out import HeldOutViews
 from hqgs.evaluation.verdict import (
     CAUSES,
     FORMS,
@@ -32,15 +32,15 @@ from hqgs.show.trust import WORST_SHOWN
 COLORS = ("#d0672a", "#8a5fbf", "#7a7a7a", "#b8c4d0", "#c9b458", "#2f7fc4", "#3f9b57")
 
 
-def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
-    """The page as HTML: `found` is what judge.json holds, `judged` the scene, and the other one.
+def judge_page(found: dict[str, Any], judged: HeldOutViews) -> str:
+    """The page as HTML: `found` is what judge.json holds, `judged` the photos and renders of the scene.
 
     Names from files are escaped; nothing in it is loaded from elsewhere.
     """
     one, against, protocol = found["scene"], found.get("against"), found["protocol"]
     shown = [name for name in LABELS if one["mean"][name] is not None]
     order = sorted(one["views"], key=lambda name: one["views"][name]["psnr"] or np.inf)
-    chosen = [judged[0].names.index(name) for name in order[:SHEET_PHOTOS]]
+    chosen = [judged.names.index(name) for name in order[:SHEET_PHOTOS]]
     names = (Path(one["name"]).name, None) if against is None else short_names(one, against)
     return filled(
         "judge.html.j2",
@@ -91,9 +91,9 @@ def _row(name: str, view: dict[str, Any], shown: Sequence[str]) -> list[str]:
 
 
 def _pair(
-    judged: Sequence[Judged], number: int, views: dict[str, Any], against: dict[str, Any] | None
+    judged: HeldOutViews, number: int, views: dict[str, Any], against: dict[str, Any] | None
 ) -> dict[str, Any]:
-    view = judged[0].views[number]
+    view = judged[number]
     measured = views[view.name]
     maps, causes = list[str](), measured["causes"]
     if causes is not None:
