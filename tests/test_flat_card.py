@@ -97,9 +97,9 @@ def in_page_pictures(g: Gaussians, _: Path) -> np.ndarray:
 
 def in_page_viewer(g: Gaussians, _: Path) -> np.ndarray:
     """Bytes of the colours, as the page's script reads them: after means, scales, quats and opacities."""
-    packed = pack_scene(g)
-    n, (low, high) = packed.head["count"], packed.head["colors"]
-    data = np.frombuffer(gzip.decompress(base64.b64decode(packed.data)), np.uint8)
+    head, packed = pack_scene(g)
+    n, (low, high) = head["count"], head["colors"]
+    data = np.frombuffer(gzip.decompress(base64.b64decode(packed)), np.uint8)
     start = 6 * n + 3 * n + 4 * n + n
     colors = low + data[start : start + 3 * n].reshape(3, n).T / 255 * (high - low)
     return np.tile(255 * colors.mean(0), (SIDE, SIDE, 1))

@@ -9,24 +9,13 @@ import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 AT_ONCE = 1 << 20  # values of a kind that are made on the way together, so that memory is bounded
 
 
-class MachineFacts(TypedDict):
-    """What the numbers of a run depend on. None: not known."""
-
-    cpu: str  # model
-    simd: str  # vector instructions in use
-    cores: int | None  # that this process may use
-    memory_gib: float | None
-    system: str
-    architecture: str
-
-
-def machine_facts() -> MachineFacts:
-    """Facts about this machine."""
+def machine_facts() -> dict[str, Any]:
+    """Facts about this machine, as JSON values; cores: that this process may use. None: not known."""
     from hqgs._rust import simd_level  # here, since the rest of this file loads nothing
 
     return {

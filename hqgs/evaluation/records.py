@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, cast
 
 from hqgs.base.files import read_json
-from hqgs.base.machine import MachineFacts
 
 if TYPE_CHECKING:
     from typing_extensions import NotRequired  # typing has it from Python 3.11 on
@@ -89,7 +88,7 @@ class Report(RunRecord):
     """report.json."""
 
     metrics: MetricsRecord
-    machine: MachineFacts
+    machine: dict[str, Any]  # `machine_facts`
     versions: dict[str, str | None]
 
 

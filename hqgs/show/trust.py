@@ -121,22 +121,22 @@ def learn_trust(gaussians: Gaussians, known: RunCameras) -> Trust:
     sums = torch.zeros(n, 2)  # of weights, and of weights times errors
     with one_torch_thread():
         looks = [error_of(gaussians, views[k], known.background) for k in evenly(len(views), PHOTOS)]
-        for off in looks:
-            pixels = torch.stack([off.counts.float(), off.error], -1)
-            sums += _back(gaussians, off.camera, torch.zeros(n, 2), pixels)
+        for camera, error, counts in looks:
+            pixels = torch.stack([counts.float(), error], -1)
+            sums += _back(gaussians, camera, torch.zeros(n, 2), pixels)
         weights = sums[:, 0] + 1
         errors = (sums[:, 1] + PRIOR) / weights
         for _ in range(4):  # more change the order of the pixels by less than its scatter
             found = torch.zeros(n)
-            for off in looks:
-                found += _back(gaussians, off.camera, errors[:, None], off.error[..., None], off.counts)[:, 0]
+            for camera, error, counts in looks:
+                found += _back(gaussians, camera, errors[:, None], error[..., None], counts)[:, 0]
             errors = (errors * found + PRIOR) / weights
     out, held = [view for view in known.views if view.held_out and shows(view)], list[Held]()
     for view in (out[k] for k in evenly(len(out), 40)):
-        off = error_of(gaussians, view, known.background)
-        if off.counts.any():
-            seen = blended(gaussians, off.camera, errors)
-            held.append(Held(view.name, off.camera, off.error.numpy(), *seen, off.counts.numpy()))
+        camera, error, counts = error_of(gaussians, view, known.background)
+        if counts.any():
+            seen = blended(gaussians, camera, errors)
+            held.append(Held(view.name, camera, error.numpy(), *seen, counts.numpy()))
     factor = calibrated(held)
     return Trust(gaussians, factor * errors, factor, tuple(held))
 
@@ -155,18 +155,12 @@ def _back(
     return values.grad
 
 
-@dataclass(frozen=True)
-class Off:
-    """A photo against its render, small."""
-
-    camera: Camera
-    error: Tensor  # [H, W], mean of the channels, white is 1; 0 where it does not count
-    counts: Tensor  # [H, W], bool, by its mask
-
-
 @torch.no_grad()
-def error_of(gaussians: Gaussians, view: KnownCamera, background: tuple[float, float, float]) -> Off:
-    """The error of a view's render."""
+def error_of(
+    gaussians: Gaussians, view: KnownCamera, background: tuple[float, float, float]
+) -> tuple[Camera, Tensor, Tensor]:
+    """Of a photo against its render, small: the camera, the error [H, W], mean of the channels, white is 1,
+    and 0 where the mask hides the photo; and where it counts, [H, W]."""
     assert view.photo is not None
     with Image.open(view.photo) as file:
         picture = file.convert("RGB")
@@ -175,7 +169,7 @@ def error_of(gaussians: Gaussians, view: KnownCamera, background: tuple[float, f
     counts = torch.from_numpy(counted(view, picture.size))
     render = gaussians.render(camera, background=background).clamp(0, 1)
     off = (render - torch.from_numpy(np.array(picture)).float() / 255) * counts[..., None]
-    return Off(camera, off.abs().mean(-1), counts)
+    return camera, off.abs().mean(-1), counts
 
 
 def shows(view: KnownCamera) -> bool:

@@ -8,7 +8,6 @@ nothing grows and nothing moves. Photos held out tell whether it pays.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +25,7 @@ from hqgs.model.formats.ply import MOST_LOGIT
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.scene.constants import BACKGROUND
-from hqgs.scene.scene import Scene, View
+from hqgs.scene.scene import Scene
 from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
 from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, coming_gradient, gradient_fault
@@ -35,7 +34,7 @@ from hqgs.training.overfitting import decay_opacities, with_dropout
 from hqgs.training.rules import DROPOUT
 
 # 300 steps gain 1.0 dB on the room of 8 photos, 600 gain 1.2; half the decay takes twice the steps.
-CLEANING_STEPS, CLEANING_DECAY = 600, 0.01  # the share of the opacities that each step takes away
+CLEANING_STEPS = 600
 
 
 @dataclass(frozen=True)
@@ -127,7 +126,7 @@ def clean(
             skipped = 0 if fault is None else skipped + 1
             if fault is None:
                 optimizer.step()
-                decay_opacities(fitted.opacities, CLEANING_DECAY)
+                decay_opacities(fitted.opacities, 0.01)
             elif skipped == MAX_SKIPPED_IN_A_ROW:
                 raise ValueError(
                     f"the {fault.what} of {', '.join(fault.tensors)} was not finite in {skipped} steps in a "
@@ -152,10 +151,8 @@ def check_frame(gaussians: Gaussians, scene: Scene, background: tuple[float, flo
     Fitting would give a scene in another frame the photos' colours, and call that a gain.
     """
     some = scene.train[:: -(-len(scene.train) // 16)]
-    worse = sum(
-        psnr is not None and psnr < flat_psnr(view)
-        for psnr, view in zip(_psnrs(gaussians, scene, some, background), some, strict=True)
-    )
+    psnrs = held_out_psnrs(gaussians, replace(scene, test=some), background)
+    worse = sum(psnr is not None and psnr < flat_psnr(view) for psnr, view in zip(psnrs, some, strict=True))
     if words := apart(worse, len(some)):
         raise ValueError(f"{scene.name}: {words}")
 
@@ -164,11 +161,5 @@ def held_out_psnrs(
     gaussians: Gaussians, scene: Scene, background: tuple[float, float, float] = BACKGROUND
 ) -> tuple[float | None, ...]:
     """PSNR of each held-out photo, dB; None where it has none."""
-    return _psnrs(gaussians, scene, scene.test, background)
-
-
-def _psnrs(
-    gaussians: Gaussians, scene: Scene, views: Sequence[View], background: tuple[float, float, float]
-) -> tuple[float | None, ...]:
-    renders = held_out_renders(replace(scene, test=[*views]), gaussians, background=background)
+    renders = held_out_renders(scene, gaussians, background=background)
     return tuple(psnr(view.render, view.photo, view.mask) for view in renders)

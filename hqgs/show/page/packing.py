@@ -20,7 +20,6 @@ from __future__ import annotations
 import base64
 import gzip
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,27 +35,12 @@ COLORS = (-0.25, 1.25)
 LEVELS = 127
 
 
-@dataclass(frozen=True)
-class PackedScene:
-    """What the page holds of a scene."""
-
-    head: dict[str, Any]  # numbers for the viewer
-    data: str  # base64 of a gzip stream
-    gaussians: int
-    left_out: int  # Gaussians
-    sh_degree: int
-
-    @property
-    def bytes(self) -> int:
-        """In the page."""
-        return len(self.data)
-
-
-def pack_scene(gaussians: Gaussians, most: int = 400_000) -> PackedScene:
+def pack_scene(gaussians: Gaussians, most: int = 400_000) -> tuple[dict[str, Any], str]:
     """Quantise the Gaussians, or of more than `most` those that show most; NaN, Inf and invisible ones go.
 
     What shows most has the largest opacity times area. Many Gaussians share a set of harmonics, so that the
-    page stays small: 50,000 Gaussians of degree 3 take less than 3 MB.
+    page stays small: 50,000 Gaussians of degree 3 take less than 3 MB. Returns numbers for the viewer, and a
+    gzip stream in base64.
     """
     g = gaussians.detached()
     keep = g.finite() & (g.activated_opacities() > 1 / 255) & (g.quats.square().sum(1) > 1e-12)
@@ -104,7 +88,7 @@ def pack_scene(gaussians: Gaussians, most: int = 400_000) -> PackedScene:
         "tops": tops,
     }
     data = base64.b64encode(gzip.compress(b"".join(parts), 9, mtime=0)).decode()
-    return PackedScene(head, data, n, len(gaussians) - n, degree)
+    return head, data
 
 
 def _byte(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:

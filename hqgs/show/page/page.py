@@ -202,20 +202,18 @@ def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
 
 
 def _scene(scene: Scene, gaussians: Gaussians, background: Json) -> dict[str, Any]:
-    packed = pack_scene(gaussians)
+    head, data = pack_scene(gaussians)
     views = [*scene.test, *scene.train]
     views = [views[k] for k in evenly(len(views), MOST_CAMERAS)]
     cameras = [view.camera for view in views]
     middle = focus([view.camera for view in scene.train])
-    note = (
-        f"{packed.gaussians:,} Gaussians, harmonics of degree {packed.sh_degree}, {packed.bytes / 1e6:.1f} MB"
-    )
-    if packed.left_out:
-        note += f"; the {packed.left_out:,} least visible ones are left out"
+    note = f"{head['count']:,} Gaussians, harmonics of degree {head['degree']}, {len(data) / 1e6:.1f} MB"
+    if left_out := len(gaussians) - head["count"]:
+        note += f"; the {left_out:,} least visible ones are left out"
     first = cameras[0]
     return {
-        "data": packed.data,
-        "head": {**packed.head, "background": background},
+        "data": data,
+        "head": {**head, "background": background},
         "views": [{"name": v.name, **_view(v.camera, middle)} for v in views],
         "up": scene_up(scene).tolist(),
         "aspect": f"{first.width} / {first.height}",
