@@ -10,9 +10,8 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from hqgs.model.constants import THINNEST
 from hqgs.model.gaussians import Gaussians, mean_square_distance
-from hqgs.model.shapes import as_discs, enlarge
+from hqgs.model.shapes import THINNEST, as_discs, enlarge
 from hqgs.scene.world import World
 from tests.reference import rotation_matrices
 

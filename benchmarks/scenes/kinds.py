@@ -113,7 +113,7 @@ KINDS |= {
     "chat": Kind(
         8, 10000, "the longest side in px", "SIDE", integer=True, at_504=252, formation=False, longest=True
     ),
-    "phone": Kind(0, 12, "stops of light that are missing", "EV", default=4, formation=False, file=True),
+    "phone": Kind(0, 12, "stops of light that are missing", "EV", default=4, formation=False),
     "video265": replace(KINDS["video"], formation=False, own=None),
 }
 OPERATORS |= {"shake": _shake, "exposure": _exposure, "chat": _chat}

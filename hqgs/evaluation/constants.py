@@ -13,4 +13,3 @@ FOG = 0.1  # of a pixel's colour from Gaussians that hang before the surface, an
 # Pictures.
 AMPLIFICATION = 4  # times: so much larger differences are drawn
 MASKED = 150, 158, 170  # difference where the mask leaves the photo out: no grey that a difference has
-SHEET_PHOTOS = 12  # in judge.html, at most

@@ -14,7 +14,7 @@ from hqgs.base.left_out import PHOTO
 from hqgs.base.stages import OnStage, silent
 from hqgs.base.text import some
 from hqgs.evaluation.records import Report, read_report
-from hqgs.scene.constants import BACKGROUND, SAME_POSE
+from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.options import LoadOptions
 from hqgs.scene.photo_files import is_run
 
@@ -164,7 +164,7 @@ def check_same(scene: Scene, run: RunFolder, split: bool) -> None:
             f"({told or 'others are held out'}): restore them, or train again"
         )
     px = moved_px(scene, known)
-    if px is None or px > SAME_POSE:
+    if px is None or px > 0.5:  # COLMAP moves them by far more where one of the photos is gone
         by = "no photo is in both" if px is None else f"points move by {px:.1f} px in the photos"
         told = told or "none is gone or new, but some have other pixels"
         raise ValueError(

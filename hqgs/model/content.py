@@ -7,7 +7,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hqgs.model.constants import CONTENT_DISTANCE, CONTENT_RAISED, CONTENT_SHARE
 from hqgs.scene.paths import circle
 from hqgs.scene.scene import Camera
 
@@ -27,15 +26,15 @@ def content(means: Tensor, opacities: Tensor) -> tuple[NDArray[np.float64], floa
         raise ValueError("the scene is empty: it has no Gaussian that can be seen")
     points, weights = points[seen], weights[seen]
     middle = np.array([_quantile(points[:, axis], weights, 0.5) for axis in range(3)])
-    radius = _quantile(np.linalg.norm(points - middle, axis=1), weights, CONTENT_SHARE)
+    radius = _quantile(np.linalg.norm(points - middle, axis=1), weights, 0.8)
     return middle, radius or 1.0
 
 
 def around(means: Tensor, opacities: Tensor, frames: int, up: ArrayLike, like: Camera | None) -> list[Camera]:
     """Cameras on a circle around the content, a little above it."""
     middle, radius = content(means, opacities)
-    away = CONTENT_DISTANCE * radius
-    return circle(middle, away, height=CONTENT_RAISED * away, frames=frames, up=up, like=like)
+    away = 2.2 * radius  # from where it fills the picture
+    return circle(middle, away, height=0.35 * away, frames=frames, up=up, like=like)
 
 
 def _quantile(values: NDArray[np.float64], weights: NDArray[np.float64], share: float) -> float:

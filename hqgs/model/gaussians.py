@@ -18,14 +18,7 @@ from hqgs.base.elementary import exp
 from hqgs.base.files import PLY
 from hqgs.base.state import own_state
 from hqgs.base.threads import one_torch_thread
-from hqgs.model.constants import (
-    CONTENT_SAMPLED,
-    INITIAL_OPACITY,
-    MAX_SH_DEGREE,
-    MIN_SQUARE_DISTANCE,
-    NEAREST,
-    SH_C0,
-)
+from hqgs.model.constants import MAX_SH_DEGREE, SH_C0
 from hqgs.model.content import around
 from hqgs.model.formats.arrays import TENSORS, Arrays
 from hqgs.model.formats.files import format_of, read_scene, scene_file, write_scene
@@ -36,6 +29,8 @@ from hqgs.scene.constants import BACKGROUND, SMALLEST, USUAL
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
 from hqgs.scene.world import World
+
+NEAREST = 3  # neighbours whose distances give a point's scale
 
 
 @dataclass(repr=False)
@@ -139,7 +134,7 @@ class Gaussians:
         return near_for(self._few())
 
     def _few(self) -> NDArray[np.float64]:
-        few = self.means.detach()[:: max(1, len(self) // CONTENT_SAMPLED)].double().numpy()
+        few = self.means.detach()[:: max(1, len(self) // 4096)].double().numpy()
         return few[np.isfinite(few).all(1)]
 
     def detached(self) -> Gaussians:
@@ -316,14 +311,14 @@ class Gaussians:
                 f"points has {bad.size} rows that are not finite, the first is row {bad[0]}: {points[bad[0]]}"
             )
         n, points = len(points), points.astype(np.float32)
-        square = np.maximum(mean_square_distance(points), MIN_SQUARE_DISTANCE)
+        square = np.maximum(mean_square_distance(points), 1e-7)  # of points that coincide
         log_scale = torch.from_numpy(0.5 * np.log(square)).float()
         sh0 = (torch.from_numpy(colors.astype(np.float32)) / 255.0 - 0.5) / SH_C0
         return cls(
             means=torch.from_numpy(points),
             scales=log_scale[:, None].repeat(1, 3),
             quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-            opacities=torch.full((n,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))),
+            opacities=torch.full((n,), math.log(0.1 / (1.0 - 0.1))),  # 0.1, Kerbl et al. 2023
             sh0=sh0[:, None, :].contiguous(),
             shN=torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3),
         )

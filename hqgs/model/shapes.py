@@ -12,9 +12,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hqgs.base.elementary import exp, log
-from hqgs.model.constants import NEAREST_OF_DISCS, THINNEST
 from hqgs.model.formats.turned import quaternions
 from hqgs.model.gaussians import Gaussians
+
+THINNEST = (1.0, 0.2, 0.1)  # of a disc's three axes, of the longest: few neighbours tell no more
 
 
 def as_discs(gaussians: Gaussians) -> Gaussians:
@@ -25,7 +26,7 @@ def as_discs(gaussians: Gaussians) -> Gaussians:
     Round Gaussians become such discs by training, which takes hundreds of steps.
     """
     means = gaussians.means.detach().numpy().astype(np.float64)
-    _, nearest = KDTree(means).query(means, min(NEAREST_OF_DISCS + 1, len(means)))  # the first is itself
+    _, nearest = KDTree(means).query(means, min(6, len(means)))  # the first is itself
     away = means[np.asarray(nearest)[:, 1:]] - means[:, None]
     away /= np.maximum(np.linalg.norm(away, axis=2, keepdims=True), np.finfo(float).tiny)
     squares, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))

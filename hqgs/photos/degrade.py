@@ -55,7 +55,7 @@ def degrade_sequence(
     photos = [_Photo(image, rng) for image, rng in zip(images, rngs, strict=True)]
     all_steps = [degradation.for_width(*photo.size).steps for photo in photos]
     for k, step in enumerate(degradation.steps):
-        if KINDS[step.kind].film:
+        if step.kind in FILMS:
             value = all_steps[0][k].value or 0
             value = int(value) if KINDS[step.kind].integer else value
             frames = FILMS[step.kind]([photo.now for photo in photos], value)

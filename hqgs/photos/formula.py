@@ -21,13 +21,11 @@ class Kind:
     formation: bool = True  # whether a method can be told of it
     some: bool = True  # whether it may happen to some of the photos only
     longest: bool = False  # whether its value is of the photo's longest side, not of its width
-    file: bool = False  # whether it ends in a JPEG file
-    film: bool = False  # whether it happens to all photos together, as the frames of a film
     own: str | None = None  # of each "photo" or "camera" its own, learned with the scene; or "found" before
 
 
 KINDS = {
-    "jpeg": Kind(1, 95, "a quality", "QUALITY", integer=True, file=True),
+    "jpeg": Kind(1, 95, "a quality", "QUALITY", integer=True),
     "noise": Kind(0.01, 255, "a standard deviation, where white is 255", "SIGMA"),
     "lowres": Kind(2, 16, "a factor", "FACTOR", integer=True, some=False),
     "blur": Kind(0.1, 50, "sigma in px", "SIGMA", at_504=2.5),
@@ -39,9 +37,7 @@ KINDS = {
     "vignetting": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
     "response": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
     "grain": Kind(0, math.inf, "no value", default=0, some=False, own="found"),
-    "video": Kind(
-        0, 51, "a constant rate factor", "CRF", integer=True, default=36, some=False, film=True, own="found"
-    ),
+    "video": Kind(0, 51, "a constant rate factor", "CRF", integer=True, default=36, some=False, own="found"),
 }  # the benchmarks have more
 NONE, MIXED, SOME = "none", "mixed", "some"
 DEVICES = tuple(name for name, kind in KINDS.items() if kind.own == "camera")  # in all photos of a camera

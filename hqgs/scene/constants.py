@@ -12,11 +12,9 @@ ENOUGH_SHOW = 3  # photos: a point or pixel that fewer show tells nothing
 # What files may hold.
 MOST_SIDE = 65_535  # px: the largest that a JPEG can have; larger ones come from damaged files
 LARGEST = 1e15  # world units; beyond this, squared distances overflow 32-bit floats
-MOST_BYTES = 4e9  # of all photos, where `longest` bounds them; 1,000 of 1600 x 1200 px would be 5.8 GB
 # px: small copies of photos and frames, which tell of axes and of sharpness; cameras for photos that are
 # scaled down to no more need not be finer than such photos tell.
 COPY_SIDE = 640
-SAME_POSE = 0.5  # px of a run's photos; COLMAP moves them by far more where one of them is gone
 
 # From photos on disk to views, and to photos that are stored for COLMAP.
 JPEG_QUALITY = 95
@@ -26,14 +24,12 @@ KEPT_SIDE = 800  # px, of the photos beside cameras.json: to look at, not to tra
 
 # Where cameras stand, and which way up.
 SHOWN = 0.02  # of a photo's sides, which its points must span, and of a face, which its photo must show
-SMALLEST, GREATEST, USUAL = 0.25, 256.0, 4.0  # sizes, world units: ordinary ones; what others are brought to
+SMALLEST, USUAL = 0.25, 4.0  # sizes, world units: the least ordinary one; what others are brought to
 ONE_PLACE = 1e-12  # of the distance from the origin: what differs by less is in one place, but for rounding
 BACKGROUND = (0.0, 0.0, 0.0)  # RGB behind everything, in renders and cut-out photos, unless asked for
-EMPTY = 255  # of `View.empty`: nothing of the pixel shows anything
 
 # Camera paths.
-# px (of photos of built-in rooms too), degrees, where nothing else is said.
-PATH_SIZE, PATH_FOV = (504, 378), 60.0
+PATH_SIZE = 504, 378  # px (of photos of built-in rooms too), where nothing else is said
 
 # Similarities between frames.
 OUTLIER = 3.0  # times the usual error, or robust standard deviations: what lies farther off is no scatter

@@ -13,8 +13,8 @@ from PIL import Image
 
 from hqgs.base.files import atomic_path, new_folder
 from hqgs.base.text import some
-from hqgs.photos.degrade import Degraded, Record, degrade_sequence
-from hqgs.photos.formula import KINDS, Degradation
+from hqgs.photos.degrade import FILES, FILMS, Degraded, Record, degrade_sequence
+from hqgs.photos.formula import Degradation
 from hqgs.photos.pixels import to_uint8
 from hqgs.photos.suffixes import PHOTO_SUFFIXES
 from hqgs.scene.capture import inside
@@ -59,7 +59,7 @@ def write_degraded_scene(scene: Scene, out: str | Path, degradation: Degradation
     the new suffixes would mix up the photos' names.
     """
     last_step = degradation.steps[-1] if degradation.steps else None
-    jpeg_last = last_step is not None and KINDS[last_step.kind].file and not last_step.some
+    jpeg_last = last_step is not None and last_step.kind in FILES and not last_step.some
     enlarged = any(step.kind == "lowres" for step in degradation.steps)
     suffix = ".jpg" if jpeg_last else ".png"
     names = {view.name: _with_suffix(view.name, ".png" if enlarged else suffix) for view in scene.train}
@@ -120,7 +120,7 @@ def degraded_views(scene: Scene, degradation: Degradation, seed: int) -> Iterato
     views = sorted((*scene.train, *scene.test), key=lambda view: view.name)
     rngs = {view.name: np.random.default_rng([seed, k]) for k, view in enumerate(views)}
     factors = _factors(scene, seed) if degradation.partial else {}
-    film = any(KINDS[step.kind].film for step in degradation.steps)
+    film = any(step.kind in FILMS for step in degradation.steps)
     for group in [views] if film else [[view] for view in scene.train]:
         for view in group:
             if film and view.image.shape != views[0].image.shape:

@@ -20,7 +20,7 @@ from hqgs.scene import masks
 from hqgs.scene.axes import unseen, with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, odd_lenses, photo_folder
 from hqgs.scene.checks import broken, elsewhere, nothing
-from hqgs.scene.constants import BACKGROUND, COPY_SIDE, MOST_BYTES, TEST_EVERY
+from hqgs.scene.constants import BACKGROUND, COPY_SIDE, TEST_EVERY
 from hqgs.scene.faces import CUBE, around, faces_of
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import find_models, find_models_below, half_model, read_colmap
@@ -39,6 +39,7 @@ from hqgs.scene.views import load_views
 from hqgs.scene.wide import with_faces
 
 COLMAP = "colmap"
+MOST_BYTES = 4e9  # of all photos, where `longest` bounds them; 1,000 of 1600 x 1200 px would be 5.8 GB
 
 
 @dataclass(frozen=True, kw_only=True)

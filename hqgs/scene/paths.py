@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hqgs.base.evenly import evenly
-from hqgs.scene.constants import PATH_FOV, PATH_SIZE
+from hqgs.scene.constants import PATH_SIZE
 from hqgs.scene.scene import Camera, Scene
 
 LEAP = 10.0  # median steps: south 26, from one side of a house to another; films and walks around up to 7
@@ -27,7 +27,7 @@ def look_at(
     up: ArrayLike = UP,
     width: int = PATH_SIZE[0],
     height: int = PATH_SIZE[1],
-    fov: float = PATH_FOV,
+    fov: float = 60.0,
 ) -> Camera:
     """A camera at `eye` that looks at `target`, the principal point in the middle.
 

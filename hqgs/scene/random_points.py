@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import EMPTY
 from hqgs.scene.geometry import unproject
 from hqgs.scene.paths import sight_lines
 from hqgs.scene.scene import Scene, View
@@ -50,7 +49,7 @@ def random_points(
     for i, view in enumerate(views):
         count = RANDOM_POINTS * (i + 1) // len(views) - RANDOM_POINTS * i // len(views)
         cells = np.arange(view.image.shape[0] * view.image.shape[1])
-        shown = view.mask if view.empty is None else view.empty < EMPTY
+        shown = view.mask if view.empty is None else view.empty < 255
         if shown is not None:
             cells = cells[shown.ravel()]
         if len(cells) == 0:

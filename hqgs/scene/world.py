@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import GREATEST, ONE_PLACE, SMALLEST, USUAL
+from hqgs.scene.constants import ONE_PLACE, SMALLEST, USUAL
 from hqgs.scene.georeference import Georeference
 
 Array = NDArray[np.floating[Any]]
@@ -140,5 +140,5 @@ def world_for(centers: Array, points: Array) -> World:
         step = 10.0 ** math.ceil(math.log10(size))
         x, y, z = (round(float(value) / step) * step for value in middle)
         shift = (x, y, z)
-    unit = 1.0 if SMALLEST <= size < GREATEST else 2.0 ** round(math.log2(size / USUAL))
+    unit = 1.0 if SMALLEST <= size < 256 else 2.0 ** round(math.log2(size / USUAL))
     return World(unit, shift)

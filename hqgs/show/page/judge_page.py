@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.evaluation.constants import PATCH, SHEET_PHOTOS
+from hqgs.evaluation.constants import PATCH
 from hqgs.evaluation.held_out import HeldOutViews
 from hqgs.evaluation.verdict import (
     CAUSES,
@@ -40,7 +40,7 @@ def judge_page(found: dict[str, Any], judged: HeldOutViews) -> str:
     one, against, protocol = found["scene"], found.get("against"), found["protocol"]
     shown = [name for name in LABELS if one["mean"][name] is not None]
     order = sorted(one["views"], key=lambda name: one["views"][name]["psnr"] or np.inf)
-    chosen = [judged.names.index(name) for name in order[:SHEET_PHOTOS]]
+    chosen = [judged.names.index(name) for name in order[:12]]
     names = (Path(one["name"]).name, None) if against is None else short_names(one, against)
     return filled(
         "judge.html.j2",
