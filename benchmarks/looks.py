@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from pandas import DataFrame
 
@@ -25,7 +26,7 @@ from benchmarks.study import Cell, finished
 from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.metrics import psnr_aligned
 from hqgs.photos.formula import LEARNED, NONE, parse_formation
-from hqgs.photos.look import Look
+from hqgs.photos.look import Look, respond
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import AUTO
@@ -69,11 +70,15 @@ def put_on(scene: Scene, put: dict[str, float], seed: int) -> tuple[Scene, dict[
     return replace(scene, train=[*map(taken, scene.train)], test=[*map(taken, scene.test)]), looks
 
 
-def values_of(looks: list[Look], kind: str) -> NDArray[np.float64]:
-    """What one kind of a look does to each photo, as far as photos can tell it."""
+def curves_of(looks: list[Look], kind: str) -> NDArray[np.float64]:
+    """What one kind of a look does to each photo, as far as photos can tell it, [N, K]: the logarithms of
+    gains, of what a lens takes by r^2, and what a response adds by value."""
+    steps = np.linspace(0, 1, 17)
     if kind == "vignetting":
-        return np.array([look.vignetting @ [[0.5, 1.0], [0.25, 1.0]] for look in looks])  # of r^2
-    each = np.array([look.response[0] if kind == "response" else np.log(look.gains) for look in looks])
+        return np.array([steps * (look.vignetting @ [np.ones(17), steps]) for look in looks])
+    values = torch.from_numpy(steps).expand(3, 1, -1)
+    bends = [(respond(values, torch.from_numpy(look.response)) - values).numpy().ravel() for look in looks]
+    each = np.array(bends if kind == "response" else [np.log(look.gains) for look in looks])
     return each - each.mean(0)
 
 
@@ -110,9 +115,9 @@ def measure(cell: Cell, photos: Scene) -> Run:
         with_it, without = trained("+".join([*others, kind])), trained("+".join(others) or NONE)
         run["gain"][kind], run["gain_shown"][kind] = (with_it[0] - without[0]).tolist()
         if kind in cell.row.put:
-            true = values_of([looks[view.name] for view in scene.train], kind)
-            off = np.abs(values_of(with_it[1], kind) - true).mean()
-            run["off"][kind] = float(off / np.abs(true).mean())
+            true = curves_of([looks[view.name] for view in scene.train], kind)
+            off = np.abs(curves_of(with_it[1], kind) - true).max(1).mean()
+            run["off"][kind] = float(off / np.abs(true).max(1).mean())
     return run
 
 

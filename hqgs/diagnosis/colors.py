@@ -1,7 +1,7 @@
 """What the colours in which photos show the same points tell: the gain of each photo, and what cameras do.
 
-What a camera does to all its photos, vignetting and response, must make the colours of photos agree that had
-no part in finding it.
+What a camera does to all its photos, vignetting and response, is told with its standard error: photos and
+points scatter, each in its own way.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from hqgs.base.evenly import evenly
 from hqgs.diagnosis.photo import Finding, PhotoDiagnosis
 from hqgs.photos.formula import DEVICES
 from hqgs.photos.light import EXPONENT, OFFSET, to_linear, to_srgb
-from hqgs.photos.look import as_a_lens, as_responses
+from hqgs.photos.look import MOST_FALL, STEEPEST, as_a_lens, as_responses
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Scene, View
@@ -36,20 +37,20 @@ GAINS_LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)  # over which gains may go together, s
 SHARES = (0.25, 0.5, 0.75, 0.9, 0.97, 0.99)  # of their variance that does
 OPPONENTS = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])  # of red, green and blue
 
-# Of the error of held-back photos' colours: from so much less on, it is learned. Photos of one camera reach
-# 0.3 % and, taken for two, 7 % (a film, every second frame of it coarser); the room's 9 to 20 and 24 to 30.
-PAYS = {"vignetting": 0.05, "response": 0.1}
+# What a look changes at most, from which on it is learned: 0.1 of the logarithm of the light in the corner,
+# as much as colours that depend on the direction feign; 4 of 255 levels; SURE standard errors above both.
+LEAST = {"vignetting": 0.1, "response": 4 / 255}
+MOST = {"vignetting": MOST_FALL, "response": STEEPEST / 4}  # beyond, no lens and no sensor does so
+SURE = 2
 DEVICE_PHOTOS, DEVICES_MOST = 4, 16  # that a camera must have taken; cameras that are told apart
-DEVICE_ROUNDS, DEVICE_WEIGHTED = (8, 4)  # of means over photos and points in turn; of weights
+ROWS = 12_000  # colours of points in photos that are looked at
+# Rounds: of means over photos and points in turn; of weights; of lenses and responses.
+DEVICE_ROUNDS, DEVICE_WEIGHTED, BENT = (8, 6, 3)
+# Of the weights: what no photo tells stays 0. Points that tell r^2 hardly tell r^4 beside it.
+HOLDS_LENS, HOLDS_RESPONSE = (1e-7, 1e-4), 1e-4
 
 
 UNLIKE_GAINS = 0.05  # of the log gains: what is learned
-NO_CAMERA = {
-    "vignetting": "brightens the corners, or darkens them by more than two stops, which no lens does",
-    "response": "does not rise everywhere, as the response of a sensor does",
-}
-
-
 ROUNDS = 30  # of means and medians of photos and points in turn
 
 
@@ -180,17 +181,48 @@ class Devices:
         return len(self.vignetting)
 
 
+class Sign(NamedTuple):
+    """What a kind of look changes at most, of the camera of which that is surest."""
+
+    kind: str
+    size: (
+        float  # vignetting: of the logarithm of light in the corner, above 0 where it is darker; response: of
+    )
+    error: float  # a value, white is 1. Its standard error.
+
+    @property
+    def least(self) -> float:
+        """The size that is needed."""
+        return LEAST[self.kind] + SURE * self.error
+
+    @property
+    def possible(self) -> bool:
+        """Whether a lens or a sensor does so."""
+        return -self.least < self.size <= MOST[self.kind]
+
+    @property
+    def needed(self) -> bool:
+        return self.size >= self.least and self.possible
+
+
 @dataclass(frozen=True)
 class DeviceSigns:
-    """What cameras explain of how far photos are off each other's colours.
-
-    Shares of the error of held-back photos: what each camera's vignetting takes, and its response beside it.
-    """
+    """What photos' colours tell of their cameras."""
 
     devices: Devices
-    vignetting: float
-    response: float
-    unbounded: tuple[float, float]  # of both, where they may be what no lens and no sensor does
+    vignetting: Sign
+    response: Sign | None  # None: one camera took the photos
+
+    def undone(self, shared: SharedColors, kinds: Collection[str]) -> SharedColors:
+        """The colours without these of what cameras do: gains beside it are told from them."""
+        told, devices = shared.logs, self.devices
+        of = np.where(devices.of_photo < 0, len(devices), devices.of_photo)  # the last does nothing
+        if "response" in kinds:
+            told = straightened(told, np.concatenate([devices.response, np.zeros((1, 2, 3))])[of][:, None])
+        if "vignetting" in kinds:
+            k1, k2 = np.concatenate([devices.vignetting, np.zeros((1, 2))])[of].T[..., None]
+            told = told + (shared.squares * (k1 + shared.squares * k2))[..., None]
+        return replace(shared, logs=told)
 
 
 def grouped(views: Sequence[View]) -> Numbers:
@@ -216,140 +248,146 @@ def device_signs(views: Sequence[View], shared: SharedColors) -> DeviceSigns | N
     if not count:
         return None
     table = _Table.of(shared, of_photo)
-    kinds = ("v", "vr") if count > 1 else ("v",)
-    place = np.zeros(len(views), np.intp)  # of each photo among its camera's
-    for device in range(-1, count):
-        rows = np.flatnonzero(of_photo == device)
-        place[rows] = np.arange(len(rows))
-    counts = np.bincount(of_photo[of_photo >= 0], minlength=count)
-    errors = {(kind, bound): 0.0 for kind in ("", *kinds) for bound in (True, False)}
-    for part in (0, 1):
-        held = (place % 2 == part)[table.photo]
-        for kind in ("", *kinds):
-            found = table.fit(~held, kind)
-            for bound in (True, False):
-                looks = _as_cameras(found, counts) if bound else found
-                errors[kind, bound] += table.held_error(looks, held)
-    base, last = errors["", True] or 1.0, kinds[-1]
-    every = np.ones(len(table.photo), bool)
-    vignetting = as_a_lens(table.fit(every, "v")[:, :2].mean(2))
-    found = _as_cameras(table.fit(every, last), counts)
-    response = found[:, 2:] - (counts[:, None, None] * found[:, 2:]).sum(0) / counts.sum()
-    darker, bent = (
-        tuple((errors[one, bound] - errors[other, bound]) / base for bound in (True, False))
-        for one, other in (("", "v"), ("v", last))
-    )
-    devices = Devices(of_photo, vignetting, response)
-    return DeviceSigns(devices, darker[0], bent[0], (darker[1], bent[1]))
+    lens = Fit(np.zeros((count, 2)), np.zeros((count, 2, 2)))
+    sensors = [lens] * 3  # of red, green and blue
+    for _ in range(BENT if count > 1 else 1):
+        lens, sensors = table.cameras(lens, sensors)
+    corners = zip(lens.found.sum(1), np.sqrt(lens.covariance.sum((1, 2))), strict=True)
+    darker = _surest([Sign("vignetting", *corner) for corner in corners])
+    bent = _surest([sign for sensor in sensors for sign in _bends(sensor)]) if count > 1 else None
+    response = as_responses(np.stack([sensor.found for sensor in sensors], 2))
+    return DeviceSigns(Devices(of_photo, as_a_lens(lens.found), response), darker, bent)
 
 
-def _as_cameras(found: Floats, counts: Numbers) -> Floats:
-    """Parameters [D, 4, 3] as lenses and sensors may have them: vignetting is of all colours; how far a
-    response is off the mean over photos, of which each camera took `counts`, keeps it rising."""
-    lens = as_a_lens(found[:, :2].mean(2))
-    mean = (counts[:, None, None] * found[:, 2:]).sum(0) / counts.sum()
-    response = mean + as_responses(found[:, 2:] - mean)
-    return np.concatenate([np.repeat(lens[..., None], 3, 2), response], 1)
+def _bends(sensor: Fit) -> Iterator[Sign]:
+    """How far the response of each camera is off, where it is farthest."""
+    v = np.linspace(0, 1, 33)
+    changes = np.stack([v * (1 - v), v * (1 - v) * (1 - 2 * v)])  # of a value, by a and b
+    for each, errors in zip(sensor.found, sensor.covariance, strict=True):
+        change = np.abs(each @ changes)
+        at = changes[:, change.argmax()]
+        yield Sign("response", float(change.max()), float(np.sqrt(at @ errors @ at)))
+
+
+def _surest(signs: Sequence[Sign]) -> Sign:
+    return max(signs, key=lambda sign: (sign.needed, abs(sign.size) - SURE * sign.error))
+
+
+def straightened(logs: Floats, response: Floats) -> Floats:
+    """The logarithms of light [..., 3] of what cameras of these responses [..., 2, 3] have written."""
+    with np.errstate(invalid="ignore"):
+        written = to_srgb(np.exp(logs))
+    value, a, b = written, response[..., 0, :], response[..., 1, :]
+    if not response.any():
+        return logs
+    for _ in range(12):  # it rises, so they come nearer each time
+        value = written - value * (1 - value) * (a + b * (1 - 2 * value))
+    return np.log(to_linear(value))
+
+
+class Fit(NamedTuple):
+    """Parameters of each camera [D, K], and their covariances [D, K, K]."""
+
+    found: Floats
+    covariance: Floats
 
 
 @dataclass(frozen=True)
 class _Table:
     """Colours of points in photos, one row each: M rows, N photos, P points, D cameras."""
 
+    of_photo: Numbers  # [N]
     photo: Numbers  # [M]
     point: Numbers  # [M]
     device: Numbers  # [M]
     logs: Floats  # [M, 3]
-    basis: Floats  # [M, 4, 3], what each parameter of a camera adds to the logarithm: k1, k2, a, b
-    devices: int
+    squares: Floats  # [M]
 
     @staticmethod
     def of(shared: SharedColors, of_photo: Numbers) -> _Table:
         told = np.isfinite(shared.squares)
         points = np.flatnonzero(told.sum(0) >= 2)
-        # colours of points in photos that are looked at
-        most = max(12_000 * len(points) // max(int(told[:, points].sum()), 1), 1)
+        most = max(ROWS * len(points) // max(int(told[:, points].sum()), 1), 1)
         points = points[evenly(len(points), most)]
         photo, point = np.nonzero(told[:, points])
-        logs, square = shared.logs[photo, points[point]], shared.squares[photo, points[point]]
-        squares = np.repeat(square[:, None], 3, 1)
-        basis = np.stack([-squares, -squares * squares, *2 * [np.zeros_like(squares)]], 1)
-        table = _Table(photo, point, of_photo[photo], logs, basis, int(of_photo.max()) + 1)
-        value = to_srgb(np.exp(table.expected()))
-        # d log(light) / d value, times the bend of the response there
-        bend = EXPONENT / (value + OFFSET) * value * (1 - value)
-        basis[:, 2:] = np.stack([bend, bend * (1 - 2 * value)], 1)
-        return table
+        logs, squares = shared.logs[photo, points[point]], shared.squares[photo, points[point]]
+        return _Table(of_photo, photo, point, of_photo[photo], logs, squares)
 
-    def expected(self) -> Floats:
-        """The logarithms [M, 3] that a point's colour, a photo's gains and vignetting let expect.
-
-        Not what the photo shows there: its noise would be taken for a response.
-        """
-        every = np.ones(len(self.photo), bool)
-        added = self.added(self.fit(every, "v"))
-        colors, level = self.means(self.logs - added, every)
-        return colors[self.point] + level[self.photo] + added
-
-    def added(self, found: Floats) -> Floats:
-        """What cameras of these parameters add to each row, [M, 3]."""
-        each = np.where(self.device[:, None, None] >= 0, found[self.device], 0)
-        return (self.basis * each).sum(1)
-
-    def means(self, logs: Floats, rows: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    def means(self, logs: Floats) -> tuple[Floats, Floats]:
         """A colour of each point [P, 3] and a level of each photo [N, 3] whose sums are these rows' best."""
-        photo, point, logs = self.photo[rows], self.point[rows], logs[rows]
-        colors, level = np.zeros((self.point.max() + 1, 3)), np.zeros((self.photo.max() + 1, 3))
-        seen = np.maximum(np.bincount(point, minlength=len(colors)), 1)[:, None]
-        of_photo = np.maximum(np.bincount(photo, minlength=len(level)), 1)[:, None]
+        colors, level = np.zeros((self.point.max() + 1, 3)), np.zeros((len(self.of_photo), 3))
         for _ in range(DEVICE_ROUNDS):
-            colors = _sums(logs - level[photo], point, len(colors)) / seen
-            level = _sums(logs - colors[point], photo, len(level)) / of_photo
+            colors = _mean(logs - level[self.photo], self.point, len(colors))
+            level = _mean(logs - colors[self.point], self.photo, len(level))
         return colors, level
 
-    def fit(self, rows: NDArray[np.bool_], kind: str) -> Floats:
-        """Parameters [D, 4, 3] from these rows, each channel by itself: least absolute errors, beside a gain
-        of each photo and a colour of each point. `kind`: "" for none, "v" and "vr"."""
-        found = np.zeros((self.devices, 4, 3))
-        columns = {"": 0, "v": 2, "vr": 4}[kind]
-        chosen = np.flatnonzero(rows)
-        if not columns or not len(chosen):
-            return found
-        photo, point, device = self.photo[chosen], self.point[chosen], self.device[chosen]
-        own = device[:, None] == np.arange(self.devices)
-        for c in range(3):
-            design = (own[:, :, None] * self.basis[chosen, None, :columns, c]).reshape(len(chosen), -1)
-            both = np.column_stack([self.logs[chosen, c], design])
-            weights, theta = np.ones(len(chosen)), np.zeros(design.shape[1])
-            for _ in range(DEVICE_WEIGHTED):
-                left = _within(both, photo, point, weights)
-                y, X = left[:, 0], left[:, 1:]
-                normal = X.T @ (weights[:, None] * X)
-                # of the weights: what no photo tells stays 0
-                normal[np.diag_indices_from(normal)] += (1e-4) * weights.sum()
-                theta = np.linalg.solve(normal, X.T @ (weights * y))
-                rest = np.abs(y - X @ theta)
-                weights = 1 / np.maximum(rest, np.median(rest) + 1e-6)
-                weights /= weights.mean()
-            found[:, :columns, c] = theta.reshape(self.devices, columns)
-        return found
+    def cameras(self, lens: Fit, sensors: Sequence[Fit]) -> tuple[Fit, list[Fit]]:
+        """What lenses (k1, k2) and sensors (a, b; of mean 0 over photos) do, told from first guesses."""
+        taken = self.device >= 0
+        response = np.stack([sensor.found for sensor in sensors], 2)
+        own = np.where(taken[:, None, None], response[self.device], 0)
+        straight = straightened(self.logs, own)
+        radii = -np.stack([self.squares, self.squares**2], 1)
+        lens = self.fit(straight.mean(1), radii, HOLDS_LENS)
+        fall = np.where(taken, (radii * as_a_lens(lens.found)[self.device]).sum(1), 0)[:, None]
+        counts = np.bincount(self.of_photo[self.of_photo >= 0])
+        if len(counts) == 1:
+            return lens, [*sensors]
+        # at what the other photos let expect: a photo's own noise would be taken for a response
+        colors, level = self.means(straight - fall)
+        value = to_srgb(np.exp(colors[self.point] + level[self.photo] + fall))
+        slope = EXPONENT / (value + OFFSET) * value * (1 - value)  # d log(light) / d value, times the bend
+        basis = np.stack([slope, slope * (1 - 2 * value)], 1)  # [M, 2, 3]
+        logs = straight - fall + (basis * own).sum(1)
+        fits = [self.fit(logs[:, c], basis[..., c], (HOLDS_RESPONSE,) * 2) for c in range(3)]
+        return lens, [fit._replace(found=fit.found - counts @ fit.found / counts.sum()) for fit in fits]
 
-    def held_error(self, found: Floats, held: NDArray[np.bool_]) -> float:
-        """How far held-back photos, each with its best gain, are off the points' colours in the others: the
-        mean of absolute logarithms."""
-        logs = self.logs - self.added(found)
-        colors, _ = self.means(logs, ~held)
-        count = np.bincount(self.point[~held], minlength=len(colors))
-        rows = held & (count[self.point] > 0)
-        off, photo = logs[rows] - colors[self.point[rows]], self.photo[rows]
-        for one in np.unique(photo):
-            off[photo == one] -= np.median(off[photo == one], axis=0)
-        return float(np.abs(off).sum())
+    def fit(self, logs: Floats, basis: Floats, holds: Sequence[float]) -> Fit:
+        """What each camera adds to `logs` [M], by parameters of `basis` [M, K].
+
+        Beside a gain of each photo and a colour of each point. Least absolute errors, each point's in shares
+        of its own; `holds` [K], of the weights, keep parameters small. Covariances are those of errors that
+        go together within photos and within points (Cameron, Gelbach and Miller 2011).
+        """
+        count, photo, point = int(self.of_photo.max()) + 1, self.photo, self.point
+        own = self.device[:, None] == np.arange(count)
+        both = np.column_stack([logs, (own[..., None] * basis[:, None]).reshape(len(logs), -1)])
+        weights, found = np.ones(len(logs)), np.zeros(count * len(holds))
+        small, covariance = np.ones(len(logs), bool), np.zeros((len(found), len(found)))
+        for _ in range(DEVICE_WEIGHTED):
+            left = _within(both, photo, point, weights)
+            y, X = left[:, 0], left[:, 1:]
+            held = np.diag(np.tile(holds, count)) * weights.sum()
+            found = np.linalg.solve(X.T @ (weights[:, None] * X) + held, X.T @ (weights * y))
+            rest = y - X @ found
+            scores = (weights * rest)[:, None] * X
+            together = _products(scores, photo) + _products(scores, point) - scores.T @ scores
+            # of an absolute error only the rounded tip has a curvature
+            inverse = np.linalg.inv(X.T @ ((weights * small)[:, None] * X) + held)
+            covariance = inverse @ together @ inverse
+            rest = np.abs(rest)
+            median = np.median(rest) + 1e-6
+            of_point = ((np.bincount(point, rest) + 2 * median) / (np.bincount(point) + 2))[point]
+            small = rest < of_point / 2
+            weights = 1 / (np.maximum(rest, of_point / 2) * of_point)
+            weights /= weights.mean()
+        errors = covariance.reshape(count, len(holds), count, len(holds))
+        return Fit(found.reshape(count, -1), np.stack([errors[d, :, d] for d in range(count)]))
 
 
 def _sums(values: Floats, at: Numbers, count: int) -> Floats:
     """Of the rows of `values` [M, K] at each of `count` places, [count, K]."""
     return np.stack([np.bincount(at, column, minlength=count) for column in values.T], 1).astype(np.float64)
+
+
+def _mean(values: Floats, at: Numbers, count: int) -> Floats:
+    return _sums(values, at, count) / np.maximum(np.bincount(at, minlength=count), 1)[:, None]
+
+
+def _products(scores: Floats, at: Numbers) -> Floats:
+    """Of the sums of `scores` [M, K] within each group, [K, K]."""
+    sums, groups = _sums(scores, at, int(at.max()) + 1), len(np.unique(at))
+    return sums.T @ sums * groups / max(groups - 1, 1)
 
 
 def _within(values: Floats, photo: Numbers, point: Numbers, weights: Floats) -> Floats:
@@ -382,14 +420,22 @@ def device_findings(signs: DeviceSigns | None) -> tuple[Finding, Finding]:
         why = f"not measured: no camera is known to have taken {DEVICE_PHOTOS} photos or more"
         vignetting, response = (Finding(name, why) for name in DEVICES)
         return vignetting, response
-    found: list[Finding] = []
-    for name, less, more in zip(DEVICES, (signs.vignetting, signs.response), signs.unbounded, strict=True):
-        needed = less >= PAYS[name]
-        reason = f"with a {name} for each camera photos would agree better by {less:.1%}"
-        reason += "" if needed else f" (needed from {PAYS[name]:.0%})"
-        if more >= PAYS[name] and less < more / 2:
-            needed = False
-            reason = f"the {name} that makes photos agree better by {more:.1%} {NO_CAMERA[name]}: the light "
-            reason += "changed (flash, reflections)"
-        found.append(Finding(name, reason, name if needed else None, less))
-    return found[0], found[1]
+    lens, sensor = signs.vignetting, signs.response
+    way, size = ("darker", lens.size) if lens.size > 0 else ("brighter", -lens.size)
+    shares = [1 - np.exp(-value) for value in (size, lens.error, lens.least)]
+    reason = f"corners are {shares[0]:.0%} {way} than the middle (standard error {shares[1]:.0%})"
+    vignetting = _device_finding(lens, reason, f"{shares[2]:.0%} darker")
+    if sensor is None:
+        return vignetting, Finding("response", "one camera took the photos")
+    levels = [255 * value for value in (sensor.size, sensor.error, sensor.least)]
+    reason = f"cameras write the same light {levels[0]:.0f} levels off their mean"
+    reason += f" (standard error {levels[1]:.0f})"
+    return vignetting, _device_finding(sensor, reason, f"{levels[2]:.0f}")
+
+
+def _device_finding(sign: Sign, reason: str, least: str) -> Finding:
+    if sign.needed:
+        return Finding(sign.kind, reason, sign.kind, sign.size)
+    if not sign.possible:
+        return Finding(sign.kind, f"{reason}, which no camera does: the light changed (flash, reflections)")
+    return Finding(sign.kind, f"{reason} (needed from {least})", None, sign.size)

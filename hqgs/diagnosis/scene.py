@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -16,6 +16,7 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.state import own_state
 from hqgs.diagnosis.colors import (
     DeviceSigns,
+    SharedColors,
     device_findings,
     device_signs,
     exposure_finding,
@@ -25,7 +26,7 @@ from hqgs.diagnosis.colors import (
 from hqgs.diagnosis.differences import shake_finding
 from hqgs.diagnosis.focus import MOST_PHOTOS, focus_finding
 from hqgs.diagnosis.photo import Finding, Inspected, PhotoDiagnosis, conclude, inspect_photo
-from hqgs.photos.formula import KINDS, NONE, parse_formation, within
+from hqgs.photos.formula import DEVICES, KINDS, NONE, parse_formation, within
 from hqgs.scene.scene import Scene, View
 
 SCENE_WHITE = 0.2  # up to this correlation of neighbours, noise counts as white
@@ -98,19 +99,23 @@ class Inspector:
         given = view.name, view.image, view.low, view.film
         return self._once(lambda: inspect_photo(*given), "photo", [view])
 
-    def log_gains(self, scene: Scene) -> NDArray[np.float64] | None:
-        """`hqgs.diagnosis.colors.log_gains` of the training photos."""
-        return self._by_colors(scene)[0]
+    def log_gains(self, scene: Scene, beside: Collection[str] = ()) -> NDArray[np.float64] | None:
+        """`hqgs.diagnosis.colors.log_gains` of the training photos, beside these kinds of what cameras do."""
+        shared, signs = self._by_colors(scene)
+        if shared is None:
+            return None
+        kinds = tuple(kind for kind in DEVICES if kind in beside)
+        told = shared if signs is None else signs.undone(shared, kinds)
+        return self._once(lambda: log_gains(scene, told), ("gains", kinds), scene.train)
 
     def device_signs(self, scene: Scene) -> DeviceSigns | None:
         """`hqgs.diagnosis.colors.device_signs` of the training photos."""
         return self._by_colors(scene)[1]
 
-    def _by_colors(self, scene: Scene) -> tuple[NDArray[np.float64] | None, DeviceSigns | None]:
-        def told() -> tuple[NDArray[np.float64] | None, DeviceSigns | None]:
-            if (shared := shared_colors(scene)) is None:
-                return None, None
-            return log_gains(scene, shared), device_signs(scene.train, shared)
+    def _by_colors(self, scene: Scene) -> tuple[SharedColors | None, DeviceSigns | None]:
+        def told() -> tuple[SharedColors | None, DeviceSigns | None]:
+            shared = shared_colors(scene)
+            return shared, None if shared is None else device_signs(scene.train, shared)
 
         return self._once(told, "colors", scene.train)
 
@@ -144,8 +149,9 @@ class Inspector:
     def _own(self, scene: Scene, photos: Sequence[PhotoDiagnosis]) -> tuple[Finding, ...]:
         """What photos and cameras have of their own."""
         shake = shake_finding(scene)
-        exposure = exposure_finding(self.log_gains(scene), photos)
         devices = device_findings(self.device_signs(scene))
+        beside = [device.name for device in devices if device.needed]
+        exposure = exposure_finding(self.log_gains(scene, beside), photos)
         return exposure, *devices, shake, focus_finding(scene, shake.needed)
 
 

@@ -273,7 +273,8 @@ class LearnedCameras:
         """Learning rates after this part of the run."""
         width, trained = float(np.mean(self._widths)), {group["name"] for group in self.param_groups()}
         first = {"paths": 8e-4 * width, "lenses": 4e-4 * width, "gains": 0.005}
-        first |= {"vignetting": 0.001, "response": 0.001}  # which each photo of a camera moves
+        # which each photo of a camera moves; a scene takes over some of its lenses' fall where it can
+        first |= {"vignetting": 0.0003, "response": 0.001}
         return {name: rate * CAMERA_RATES_LEFT**part for name, rate in first.items() if name in trained}
 
     def state_dict(self) -> dict[str, Tensor]:

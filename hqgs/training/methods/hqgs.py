@@ -80,7 +80,7 @@ class HQGS(Method[FormedTarget]):
         if kinds & set(LEARNED):
             gains = None
             if "exposure" in kinds:
-                gains = inspector.log_gains(scene)
+                gains = inspector.log_gains(scene, kinds)
                 gains = np.zeros((len(scene.train), 3)) if gains is None else gains
             devices = None
             if kinds & set(DEVICES):
