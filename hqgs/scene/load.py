@@ -214,10 +214,9 @@ def scene_folder(path: str | Path) -> tuple[Path, list[str]]:
     )
     if bare or formats_of(root, 1.0):
         return root, []
-    found = sorted({file.parent for name in (SINGLE, TRAIN, POSES) for file in root.glob(f"*/{name}")})
-    found = found or sorted(
-        {file.parent for name in (SINGLE, TRAIN, POSES) for file in root.glob(f"*/*/{name}")}
-    )
+    names = (SINGLE, TRAIN, POSES)
+    below = ({file.parent for name in names for file in root.glob(f"{deep}/{name}")} for deep in ("*", "*/*"))
+    found = sorted(next(filter(None, below), ()))
     if len(found) > 1:
         inner = some([folder.relative_to(root).as_posix() for folder in found])
         raise ValueError(f"{root} holds several scenes: give one of {inner}")

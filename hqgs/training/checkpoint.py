@@ -18,21 +18,10 @@ from torch import Tensor
 
 from hqgs.base.files import atomic_path
 from hqgs.scene.scene import Scene
+from hqgs.training.config import LENGTHS, Due
 
 FORMAT = 8  # raised when a newer reader could not use an older file
 FREE_FIELDS = ("eval_every", "checkpoint_every")  # may differ on resume: they do not change the result
-# In a longer run too.
-LENGTH_FIELDS = (
-    "iterations",
-    "sh_interval",
-    "start",
-    "stop",
-    "every",
-    "leave_out",
-    "seconds",
-    "turn",
-    "timed",
-)
 
 
 def save_checkpoint(path: str | Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
@@ -101,7 +90,7 @@ def check_same(
 
     `longer`: this run goes on where the saved one ended, so that the fields of its length may differ.
     """
-    free = (*FREE_FIELDS, *LENGTH_FIELDS) if longer else FREE_FIELDS
+    free = {*LENGTHS, *Due._fields, "leave_out"} if longer else {*FREE_FIELDS}
     if not isinstance(saved, dict):
         raise ValueError(f"{path} is damaged: {prefix or 'config'} is {saved!r:.80}")
     for name in here | saved:

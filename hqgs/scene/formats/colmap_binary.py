@@ -37,11 +37,6 @@ def _skip_image(data: mmap.mmap, at: int) -> int:
     return at + 8 + 24 * _read(_U64, data, at)
 
 
-def _skip_point(data: mmap.mmap, at: int) -> int:
-    at += _POINT_HEAD
-    return at + 8 + 8 * _read(_U64, data, at)
-
-
 def _skip_rig(data: mmap.mmap, at: int) -> int:
     sensors = _read(_U32, data, at + 4)
     at += 8 + (_SENSOR if sensors else 0)
@@ -53,16 +48,17 @@ def _skip_rig(data: mmap.mmap, at: int) -> int:
     return at
 
 
-def _skip_frame(data: mmap.mmap, at: int) -> int:
-    at += 8 + _POSE
-    return at + 4 + (_SENSOR + 8) * _read(_U32, data, at)
-
-
 _RECORDS: dict[str, tuple[Callable[[mmap.mmap, int], int], int]] = {  # how to skip one, its smallest size
     "images.bin": (_skip_image, _IMAGE_HEAD + 1 + 8),
-    "points3D.bin": (_skip_point, _POINT_HEAD + 8),
+    "points3D.bin": (
+        lambda data, at: at + _POINT_HEAD + 8 + 8 * _read(_U64, data, at + _POINT_HEAD),
+        _POINT_HEAD + 8,
+    ),
     "rigs.bin": (_skip_rig, 8),
-    "frames.bin": (_skip_frame, 8 + _POSE + 4),
+    "frames.bin": (
+        lambda data, at: at + 8 + _POSE + 4 + (_SENSOR + 8) * _read(_U32, data, at + 8 + _POSE),
+        8 + _POSE + 4,
+    ),
 }
 
 

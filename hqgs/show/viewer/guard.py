@@ -45,12 +45,6 @@ def allowed(host: str | None, origin: str | None) -> bool:
     return origin is None or origin == f"http://{host}"
 
 
-def port_of(connection: Any) -> int:
-    """The port at which a connection came in."""
-    address = getattr(connection, "local_address", None)
-    return int(address[1]) if address else PORT
-
-
 def check(port: int) -> None:
     """ValueError where viser, the extra `view`, is not installed, or the port is none; loads nothing."""
     if not 0 <= port <= 65535:
@@ -91,7 +85,8 @@ def start_server(port: int = PORT, label: str = "hqgs") -> viser.ViserServer:
             hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
             single = len(hosts) == 1 and len(origins) <= 1
             if not single or not allowed(hosts[0], origins[0] if origins else None):
-                text = REFUSED.format(port=port_of(connection)).encode()
+                address = getattr(connection, "local_address", None)
+                text = REFUSED.format(port=int(address[1]) if address else PORT).encode()
                 headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(text))})
                 return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, text)
             return answer(connection, request)

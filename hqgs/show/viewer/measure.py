@@ -61,12 +61,6 @@ def told_distance(a: Point, b: Point, world: World) -> str:
     return f"{length:.{digits}f} ± {error:.{digits}f} {unit} (95 %{scale})"
 
 
-def told_points(a: Point, b: Point, world: World) -> str:
-    """How the two points are given to --distance: in the frame of the scene's files, whatever a metre is."""
-    ends = (world.out(point.at) / (world.metres or 1.0) for point in (a, b))
-    return "--distance " + " ".join(",".join(f"{x:.9g}" for x in end) for end in ends) + " METRES"
-
-
 class Ruler:
     """The folder "Measure" of the page."""
 
@@ -97,9 +91,11 @@ class Ruler:
         self._marks.append(ball)
         self.told.content = "Click the second point."
         if len(self._points) == 2:
-            a, b = self._points
-            told, given = told_distance(a, b, self.world), told_points(a, b, self.world)
-            self.told.content = f"{told}\n\nhqgs train: `{given}`"
+            told, world = told_distance(*self._points, self.world), self.world
+            # In the frame of the scene's files, whatever a metre is.
+            ends = [world.out(point.at) / (world.metres or 1.0) for point in self._points]
+            given = " ".join(",".join(f"{x:.9g}" for x in end) for end in ends)
+            self.told.content = f"{told}\n\nhqgs train: `--distance {given} METRES`"
 
     def _switch(self, _: object) -> None:
         self._clear()
