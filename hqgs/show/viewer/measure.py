@@ -91,9 +91,10 @@ class Ruler:
         self._marks.append(ball)
         self.told.content = "Click the second point."
         if len(self._points) == 2:
-            told, world = told_distance(*self._points, self.world), self.world
+            a, b = self._points
+            told, world = told_distance(a, b, self.world), self.world
             # In the frame of the scene's files, whatever a metre is.
-            ends = [world.out(point.at) / (world.metres or 1.0) for point in self._points]
+            ends = [world.out(point.at) / (world.metres or 1.0) for point in (a, b)]
             given = " ".join(",".join(f"{x:.9g}" for x in end) for end in ends)
             self.told.content = f"{told}\n\nhqgs train: `--distance {given} METRES`"
 
