@@ -58,22 +58,8 @@ def project_forward(
     sh_degree: int | None,
     activate: bool = False,
     knobs: tuple[float, float, str, bool] | None = None,
+    all: bool = True,
 ) -> tuple[Frame, Array, Array, Array, Array, Array, Array]: ...
-def pictures(
-    means: Array,
-    quats: Array,
-    scales: Array,
-    opacities: Array,
-    colors: Array,
-    rest: Array | None,
-    viewmats: Array,
-    ks: Array,
-    width: int,
-    height: int,
-    options: tuple[float, float, float, float, bool, bool],
-    sh_degree: int | None,
-    backgrounds: Array | None,
-) -> Array: ...
 def project_backward(
     frame: Frame,
     inputs: tuple[Array, Array, Array, Array],
@@ -83,6 +69,7 @@ def project_backward(
 def composite_forward(
     frame: Frame, colors: Array, backgrounds: Array | None, channels: int
 ) -> tuple[Composite, Array, Array]: ...
+def composite_picture(frame: Frame, colors: Array, backgrounds: Array | None) -> Array: ...
 def composite_backward(
     composite: Composite,
     backgrounds: Array | None,
@@ -93,7 +80,6 @@ def composite_backward(
 def photometric(
     render: Array, target: Array, mask: Array | None, lambda_dssim: float, knee: float, want_grad: bool
 ) -> tuple[float, float, float | None, Array | None]: ...
-def ssim(a: Array, b: Array, mask: Array | None = None) -> float: ...
 
 class Exposure:
     """A taken photo, for its gradient."""

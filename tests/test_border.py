@@ -366,11 +366,14 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
     return {
         "project_forward": (_rust.project_forward, forward),
         "project_forward of harmonics": (_rust.project_forward, harmonics),
-        "pictures": (_rust.pictures, {**forward, "backgrounds": np.zeros((2, 3))}),
         "project_backward": (project_backward, {**inputs, **cotangents}),
         "composite_forward": (
             _rust.composite_forward,
             {"frame": frame, "colors": forward["colors"], "backgrounds": np.zeros((2, 3)), "channels": 3},
+        ),
+        "composite_picture": (
+            _rust.composite_picture,
+            {"frame": frame, "colors": forward["colors"], "backgrounds": np.zeros((2, 3))},
         ),
         "composite_backward": (
             _rust.composite_backward,
@@ -382,7 +385,6 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
         "photometric": (
             _rust.photometric, {"render": pictures[0], "target": pictures[1], "mask": mask, **photo}
         ),
-        "ssim": (_rust.ssim, {"a": pictures[0], "b": pictures[1], "mask": mask}),
         "cell_distance": (_rust.cell_distance, {**cells, "scale": 1.0, "want_grad": True}),
         "adam_steps": (adam_steps, {**adam, **options, "used": 2}),
         "Separable": (
@@ -461,7 +463,6 @@ def test_a_wrong_shape_is_named_with_the_right_one(call: str, name: str, change:
         ("adam_steps", "param"),
         ("cell_distance", "x"),
         ("photometric", "render"),
-        ("ssim", "a"),
         ("add_rows", "sums"),
         ("add_pulls", "gradient"),
         ("all_below", "single"),
@@ -473,7 +474,7 @@ def test_a_wrong_shape_is_named_with_the_right_one(call: str, name: str, change:
         leading and (call in ("adam_steps", "cell_distance") or change == "one more")
     )
     free |= change == "one more" and (
-        call == "Separable" or (name == "colors" and call in ("pictures", "project_forward"))
+        call == "Separable" or (name == "colors" and call in ("composite_picture", "project_forward"))
     )
     if free:
         pytest.skip("any such shape will do, and the others follow it")

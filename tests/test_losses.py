@@ -156,7 +156,8 @@ def test_ssim_of_the_binding() -> None:
     target = photo.double() / 255
     for used, array in ((mask, counts), (None, None)):
         expected = 1 - reference(render, target, used, 1.0).item()
-        assert _rust.ssim(render.numpy(), target.numpy(), array) == pytest.approx(expected, abs=1e-12)
+        _, _, value, _ = _rust.photometric(render.numpy(), target.numpy(), array, 1.0, 0.0, False)
+        assert value == pytest.approx(expected, abs=1e-12)
 
 
 def test_bad_input_is_named() -> None:

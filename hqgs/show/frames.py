@@ -186,10 +186,11 @@ class Activated:
                 return seen.mul_(255).round_().clamp_(0, 255).byte().numpy()
         viewmat, K = (np.ascontiguousarray(m[None], np.float64) for m in (camera.viewmat, camera.K))
         width, height = camera.width, camera.height
-        picture = _rust.pictures(
-            *self._arrays, viewmat, K, width, height, self._options,
-            self.degree, np.array([[*background]], self._arrays[0].dtype),
-        )  # fmt: skip
+        frame, *_, colors = _rust.project_forward(
+            *self._arrays, viewmat, K, width, height, self._options, self.degree, all=False
+        )
+        behind = np.array([[*background]], colors.dtype)
+        picture = _rust.composite_picture(frame, colors.reshape(-1, 3), behind)
         return picture.reshape(height, width, 3)
 
     @torch.no_grad()

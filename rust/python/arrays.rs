@@ -41,8 +41,10 @@ impl<'py, T: Element> Array<'py, T> {
         })
     }
 
-    pub(crate) fn slice(&self) -> BindingResult<&[T]> {
-        Ok(self.array.as_slice()?)
+    pub(crate) fn slice(&self) -> &[T] {
+        self.array
+            .as_slice()
+            .expect("contiguous, as `as_it_is` checks")
     }
 }
 
@@ -54,8 +56,9 @@ impl<'py, T: Element> ArrayMut<'py, T> {
         })
     }
 
-    pub(crate) fn slice(&mut self) -> BindingResult<&mut [T]> {
-        Ok(self.array.as_slice_mut()?)
+    pub(crate) fn slice(&mut self) -> &mut [T] {
+        let slice = self.array.as_slice_mut();
+        slice.expect("contiguous, as `as_it_is` checks")
     }
 }
 
@@ -92,6 +95,15 @@ impl<A> Borrowed<A> {
             [n, w] if w == width => Ok((self, n)),
             _ => Err(self.wrong(&format!("[N, {width}]"))),
         }
+    }
+
+    /// The sizes of the last `axes` axes of [N, ...] or, one for each camera, [C, N, ...].
+    pub(crate) fn row(&self, n: usize, cameras: usize, axes: usize) -> Result<&[usize], Error> {
+        let (of, row) = self.shape.split_at(self.shape.len().saturating_sub(axes));
+        if of == [n] || of == [cameras, n] {
+            return Ok(row);
+        }
+        Err(self.wrong(&format!("[{n}, ...] or [{cameras}, {n}, ...]")))
     }
 
     fn wrong(&self, expected: &str) -> Error {
@@ -210,21 +222,15 @@ fn wrong_type(name: &str, expected: impl Display, value: &Bound<'_, PyAny>) -> P
 
 pub(crate) type Optional<'a, 'py> = Option<&'a Bound<'py, PyAny>>;
 
-pub(crate) fn optional<'py, T: Element>(
-    name: &'static str,
-    value: Optional<'_, 'py>,
-) -> BindingResult<Option<Array<'py, T>>> {
-    value.map(|v| Array::new(name, v)).transpose()
-}
-
 /// An optional array that must have this shape where it is given.
 pub(crate) fn optional_of_shape<'py, T: Element>(
     name: &'static str,
     value: Optional<'_, 'py>,
     expected: &[usize],
 ) -> BindingResult<Option<Array<'py, T>>> {
-    let array = optional::<T>(name, value)?;
-    Ok(array.map(|a| a.of_shape(expected)).transpose()?)
+    value
+        .map(|v| Ok(Array::new(name, v)?.of_shape(expected)?))
+        .transpose()
 }
 
 /// Whether `value` is an array of f32; otherwise it is one of f64.
@@ -238,21 +244,9 @@ pub(crate) fn is_f32(name: &str, value: &Bound<'_, PyAny>) -> BindingResult<bool
     }
 }
 
-/// The elements of what `name` says.
-pub(crate) fn filled<T>(
-    elements: impl ExactSizeIterator<Item = T>,
-    name: &str,
-) -> Result<Vec<T>, Error> {
-    let mut vector = with_capacity(elements.len(), name)?;
-    vector.extend(elements);
-    Ok(vector)
-}
-
 /// A gradient to be filled, with no elements if it is not `wanted`.
-pub(crate) fn gradient<T: Real>(len: usize, wanted: bool) -> BindingResult<Vec<T>> {
-    Ok(threads::install(|| {
-        zeros(if wanted { len } else { 0 }, "gradient")
-    })??)
+pub(crate) fn gradient<T: Real>(py: Python<'_>, len: usize, wanted: bool) -> BindingResult<Vec<T>> {
+    threads::run(py, || zeros(if wanted { len } else { 0 }, "gradient"))
 }
 
 /// One array of every camera's outputs, one after the other, [C, ...].
@@ -292,13 +286,15 @@ pub(crate) trait Scalar: Real + Element {}
 impl Scalar for f32 {}
 impl Scalar for f64 {}
 
-/// Call the generic function for the dtype of the array of this name.
+/// Do the body with `$T` as the type of the numbers of the array of this name.
 macro_rules! by_dtype {
-    ($name:literal, $array:expr, $function:ident($($argument:expr),* $(,)?)) => {
+    ($T:ident, $name:literal, $array:expr, $body:block) => {
         if $crate::arrays::is_f32($name, $array)? {
-            $function::<f32>($($argument),*)
+            type $T = f32;
+            $body
         } else {
-            $function::<f64>($($argument),*)
+            type $T = f64;
+            $body
         }
     };
 }

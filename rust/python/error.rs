@@ -1,7 +1,6 @@
 //! What a function of the binding fails with.
 
 use hqgs::Error;
-use numpy::AsSliceError;
 use pyo3::{
     CastError, PyErr,
     exceptions::{PyMemoryError, PyValueError},
@@ -32,12 +31,6 @@ impl From<PyErr> for BindingError {
 
 impl From<CastError<'_, '_>> for BindingError {
     fn from(error: CastError<'_, '_>) -> Self {
-        Self(error.into())
-    }
-}
-
-impl From<AsSliceError> for BindingError {
-    fn from(error: AsSliceError) -> Self {
         Self(error.into())
     }
 }

@@ -13,7 +13,7 @@ mod training;
 
 use error::{BindingError, BindingResult};
 use hqgs::internals::{constants, simd};
-use pyo3::{exceptions::PyOverflowError, prelude::*};
+use pyo3::prelude::*;
 use std::ffi::{c_int, c_long};
 
 /// The buffers of an iteration are as large as those of the last one: an allocator that keeps them saves the
@@ -44,30 +44,24 @@ fn give_back_memory(py: Python<'_>) -> BindingResult<()> {
         // SAFETY: any thread may call it, and the crate is linked with mimalloc.
         safe fn mi_collect(force: bool);
     }
-    py.detach(|| {
-        let each = threads::on_each(|| mi_collect(true));
-        mi_collect(true);
-        each
-    })
+    threads::run(py, || {
+        rayon::broadcast(|_| mi_collect(true));
+        Ok(())
+    })?;
+    mi_collect(true);
+    Ok(())
 }
 
 /// Use this many threads from now on, 1 to 1024; results do not depend on it.
 #[pyfunction]
-fn set_num_threads(threads: &Bound<'_, PyAny>) -> BindingResult<()> {
-    match threads.extract() {
-        Ok(count) => threads::set(count),
-        // Below 0, or beyond what fits.
-        Err(error) if error.is_instance_of::<PyOverflowError>(threads.py()) => {
-            Err(threads::out_of_range(threads).into())
-        }
-        Err(error) => Err(error.into()),
-    }
+fn set_num_threads(py: Python<'_>, threads: i128) -> BindingResult<()> {
+    threads::set(py, threads)
 }
 
 /// Number of threads in use.
 #[pyfunction]
-fn get_num_threads() -> BindingResult<usize> {
-    threads::get()
+fn get_num_threads(py: Python<'_>) -> BindingResult<usize> {
+    threads::get(py)
 }
 
 /// The vector instructions in use: the best of this CPU, or those that HQGS_SIMD names.
@@ -76,38 +70,41 @@ fn simd_level() -> BindingResult<&'static str> {
     Ok(simd::level()?.name())
 }
 
-/// The constants that define an image, for Python to use the same ones.
-fn add_constants(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    for (name, value) in [
-        ("ALPHA_MIN", constants::ALPHA_MIN),
-        ("ALPHA_MAX", constants::ALPHA_MAX),
-        ("TRANSMITTANCE_MIN", constants::TRANSMITTANCE_MIN),
-        ("EPS2D", constants::EPS2D),
-        ("NEAR_PLANE", constants::NEAR_PLANE),
-        ("FAR_PLANE", constants::FAR_PLANE),
-        ("FOV_MARGIN", constants::FOV_MARGIN),
-        ("QUAT_NORM2_MIN", constants::QUAT_NORM2_MIN),
-    ] {
-        m.add(name, value)?;
-    }
-    m.add("TILE", constants::TILE)?;
-    m.add("BLOCK", constants::BLOCK)
-}
-
 /// The extension module `hqgs._rust`.
 #[pymodule]
-fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    keep_freed_memory();
-    simd::level().map_err(BindingError::from)?; // a wrong HQGS_SIMD is told at once
-    m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
-    m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
-    m.add_function(wrap_pyfunction!(simd_level, m)?)?;
-    m.add_function(wrap_pyfunction!(give_back_memory, m)?)?;
-    add_constants(m)?;
-    project::register(m)?;
-    composite::register(m)?;
-    training::register(m)?;
-    pictures::register(m)?;
-    exposure::register(m)?;
-    stereo::register(m)
+mod _rust {
+    use super::*;
+
+    #[pymodule_export]
+    use super::{get_num_threads, give_back_memory, set_num_threads, simd_level};
+    #[pymodule_export]
+    use crate::{
+        composite::{Composite, composite_backward, composite_forward, composite_picture},
+        exposure::{Exposure, exposure_backward, exposure_forward},
+        pictures::{Separable, cell_distance},
+        project::{Frame, backward::project_backward, forward::project_forward},
+        stereo::agreed_depths,
+        training::{adam_steps, add_harmonics, add_pulls, add_rows, all_below, photometric},
+    };
+
+    #[pymodule_init]
+    fn init(m: &Bound<'_, PyModule>) -> PyResult<()> {
+        keep_freed_memory();
+        simd::level().map_err(BindingError::from)?; // a wrong HQGS_SIMD is told at once
+        // The constants that define an image, for Python to use the same ones.
+        for (name, value) in [
+            ("ALPHA_MIN", constants::ALPHA_MIN),
+            ("ALPHA_MAX", constants::ALPHA_MAX),
+            ("TRANSMITTANCE_MIN", constants::TRANSMITTANCE_MIN),
+            ("EPS2D", constants::EPS2D),
+            ("NEAR_PLANE", constants::NEAR_PLANE),
+            ("FAR_PLANE", constants::FAR_PLANE),
+            ("FOV_MARGIN", constants::FOV_MARGIN),
+            ("QUAT_NORM2_MIN", constants::QUAT_NORM2_MIN),
+        ] {
+            m.add(name, value)?;
+        }
+        m.add("TILE", constants::TILE)?;
+        m.add("BLOCK", constants::BLOCK)
+    }
 }

@@ -1,8 +1,10 @@
 //! The binding of the operators on pictures.
 
-use crate::arrays::{Array, by_dtype, gradient};
-use crate::error::BindingResult;
-use crate::threads;
+use crate::{
+    arrays::{Array, by_dtype, gradient, is_f32},
+    error::BindingResult,
+    threads,
+};
 use hqgs::{Error, Real};
 use hqgs_training::{
     jpeg_cells,
@@ -11,34 +13,11 @@ use hqgs_training::{
 use numpy::{Element, IntoPyArray};
 use pyo3::prelude::*;
 
-/// Add the functions and classes of this file to the module.
-pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_class::<Separable>()?;
-    m.add_function(wrap_pyfunction!(cell_distance, m)?)
-}
-
 /// The operator and its transpose, for either dtype.
 #[pyclass(frozen, module = "hqgs._rust")]
-struct Separable {
+pub(crate) struct Separable {
     single: (separable::Separable<f32>, separable::Separable<f32>),
     double: (separable::Separable<f64>, separable::Separable<f64>),
-}
-
-/// The operators of a dtype.
-trait Typed: Real + Element {
-    fn of(operator: &Separable) -> &(separable::Separable<Self>, separable::Separable<Self>);
-}
-
-impl Typed for f32 {
-    fn of(operator: &Separable) -> &(separable::Separable<Self>, separable::Separable<Self>) {
-        &operator.single
-    }
-}
-
-impl Typed for f64 {
-    fn of(operator: &Separable) -> &(separable::Separable<Self>, separable::Separable<Self>) {
-        &operator.double
-    }
 }
 
 /// A borrowed matrix.
@@ -48,7 +27,7 @@ fn dense<'a>(name: &'static str, matrix: &'a Array<f64>) -> BindingResult<Dense<
         return Err(Error::shape(name, "[height, width]", got).into());
     };
     Ok(Dense {
-        weights: matrix.slice()?,
+        weights: matrix.slice(),
         height,
         width,
     })
@@ -89,7 +68,11 @@ impl Separable {
         image: &Bound<'py, PyAny>,
         transposed: bool,
     ) -> BindingResult<Bound<'py, PyAny>> {
-        by_dtype!("image", image, apply_either(self, image, transposed))
+        if is_f32("image", image)? {
+            apply(of_two(&self.single, transposed), image)
+        } else {
+            apply(of_two(&self.double, transposed), image)
+        }
     }
 
     /// `apply` of the operator whose weights are the absolute values, on float32.
@@ -98,13 +81,8 @@ impl Separable {
     }
 }
 
-fn apply_either<'py, T: Typed>(
-    operator: &Separable,
-    image: &Bound<'py, PyAny>,
-    transposed: bool,
-) -> BindingResult<Bound<'py, PyAny>> {
-    let (straight, turned) = T::of(operator);
-    apply(if transposed { turned } else { straight }, image)
+fn of_two<O>((straight, turned): &(O, O), transposed: bool) -> &O {
+    if transposed { turned } else { straight }
 }
 
 fn apply<'py, T: Real + Element>(
@@ -113,8 +91,8 @@ fn apply<'py, T: Real + Element>(
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = image.py();
     let image = Array::<T>::new("image", image)?;
-    let (data, shape) = (image.slice()?, image.shape());
-    let out = py.detach(|| threads::install(|| operator.apply(data, shape)))??;
+    let (data, shape) = (image.slice(), image.shape());
+    let out = threads::run(py, || operator.apply(data, shape))?;
     Ok(out.into_pyarray(py).into_any())
 }
 
@@ -122,21 +100,7 @@ type Distance<'py> = (f64, Option<Bound<'py, PyAny>>);
 
 /// `jpeg_cells::distance`: the value and, if wanted, the flat gradient.
 #[pyfunction]
-fn cell_distance<'py>(
-    x: &Bound<'py, PyAny>,
-    centres: &Bound<'py, PyAny>,
-    widths: &Bound<'py, PyAny>,
-    scale: f64,
-    want_grad: bool,
-) -> BindingResult<Distance<'py>> {
-    by_dtype!(
-        "x",
-        x,
-        cell_distance_as(x, centres, widths, scale, want_grad)
-    )
-}
-
-fn cell_distance_as<'py, T: Real + Element>(
+pub(crate) fn cell_distance<'py>(
     x: &Bound<'py, PyAny>,
     centres: &Bound<'py, PyAny>,
     widths: &Bound<'py, PyAny>,
@@ -144,13 +108,14 @@ fn cell_distance_as<'py, T: Real + Element>(
     want_grad: bool,
 ) -> BindingResult<Distance<'py>> {
     let py = x.py();
-    let x = Array::<T>::new("x", x)?;
-    let centres = Array::<T>::new("centres", centres)?.of_shape(x.shape())?;
-    let widths = Array::<T>::new("widths", widths)?.of_shape(x.shape())?;
-    let (x, centres, widths) = (x.slice()?, centres.slice()?, widths.slice()?);
-    let mut grad = gradient::<T>(x.len(), want_grad)?;
-    let out = want_grad.then_some(&mut grad[..]);
-    let value =
-        py.detach(|| threads::install(|| jpeg_cells::distance(x, centres, widths, scale, out)))??;
-    Ok((value, want_grad.then(|| grad.into_pyarray(py).into_any())))
+    by_dtype!(T, "x", x, {
+        let x = Array::<T>::new("x", x)?;
+        let centres = Array::<T>::new("centres", centres)?.of_shape(x.shape())?;
+        let widths = Array::<T>::new("widths", widths)?.of_shape(x.shape())?;
+        let (x, centres, widths) = (x.slice(), centres.slice(), widths.slice());
+        let mut grad = gradient::<T>(py, x.len(), want_grad)?;
+        let out = want_grad.then_some(&mut grad[..]);
+        let value = threads::run(py, || jpeg_cells::distance(x, centres, widths, scale, out))?;
+        Ok((value, want_grad.then(|| grad.into_pyarray(py).into_any())))
+    })
 }

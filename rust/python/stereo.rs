@@ -1,24 +1,17 @@
 //! The binding of the search for depths.
 
-use crate::arrays::{Array, filled};
-use crate::error::BindingResult;
-use crate::threads;
+use crate::{arrays::Array, error::BindingResult, threads};
 use hqgs::Error;
 use hqgs_training::stereo::{self, Other, Photo};
 use numpy::IntoPyArray;
 use pyo3::prelude::*;
-
-/// Add the functions of this file to the module.
-pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(agreed_depths, m)?)
-}
 
 type Found<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>);
 
 /// `stereo::depths`: (depths [M] of float64, correlations [M] of float32). `first` and each of `others` [h, w] of
 /// float32, `maps` [K, 3, 4], `pixels` and `ranges` (nearest and farthest depth) [M, 2] of float64.
 #[pyfunction]
-fn agreed_depths<'py>(
+pub(crate) fn agreed_depths<'py>(
     first: &Bound<'py, PyAny>,
     others: Vec<Bound<'py, PyAny>>,
     maps: &Bound<'py, PyAny>,
@@ -38,20 +31,17 @@ fn agreed_depths<'py>(
     let first = picture("first", &first)?;
     let others = others
         .iter()
-        .zip(maps.slice()?.as_chunks().0)
+        .zip(maps.slice().as_chunks().0)
         .map(|(other, &map)| {
-            Ok(Other {
-                picture: picture("others", other)?,
-                map,
-            })
+            let picture = picture("others", other)?;
+            Ok(Other { picture, map })
         })
         .collect::<BindingResult<Vec<_>>>()?;
-    let (pixels, ranges) = (pixels.slice()?.as_chunks().0, ranges.slice()?.as_chunks().0);
-    let found = py.detach(|| {
-        threads::install(|| stereo::depths(first, &others, pixels, ranges, agreeing))
-    })??;
-    let depths = filled(found.iter().map(|(depth, _)| *depth), "depths")?;
-    let scores = filled(found.iter().map(|(_, score)| *score), "depths")?;
+    let (pixels, ranges) = (pixels.slice().as_chunks().0, ranges.slice().as_chunks().0);
+    let found = threads::run(py, || {
+        stereo::depths(first, &others, pixels, ranges, agreeing)
+    })?;
+    let (depths, scores): (Vec<_>, Vec<_>) = found.into_iter().unzip();
     Ok((
         depths.into_pyarray(py).into_any(),
         scores.into_pyarray(py).into_any(),
@@ -64,6 +54,6 @@ fn picture<'a>(name: &'static str, array: &'a Array<'_, f32>) -> BindingResult<P
     };
     Ok(Photo {
         size: [height, width],
-        grey: array.slice()?,
+        grey: array.slice(),
     })
 }

@@ -1,29 +1,20 @@
 //! The binding of the loss and of the optimizer.
 
-use crate::arrays::{Array, ArrayMut, gradient, is_f32, optional_of_shape};
-use crate::error::BindingResult;
-use crate::threads;
+use crate::{
+    arrays::{Array, ArrayMut, Optional, by_dtype, gradient, is_f32, optional_of_shape},
+    error::BindingResult,
+    threads,
+};
 use hqgs::{Error, Real};
 use hqgs_training::{
     adam::{self, AdamArrays, AdamOptions, AdamStep, Selection},
     growth::{self, Pulls},
-    loss::{self, LossOptions, LossScratch, Sample},
+    loss::{self, Images, LossOptions, LossScratch},
     views::{self, ViewColors, ViewRows},
 };
 use numpy::{Element, IntoPyArray, PyArrayDyn};
 use pyo3::prelude::*;
 use std::cell::RefCell;
-
-/// Add the functions of this file to the module.
-pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(photometric, m)?)?;
-    m.add_function(wrap_pyfunction!(ssim, m)?)?;
-    m.add_function(wrap_pyfunction!(adam_steps, m)?)?;
-    m.add_function(wrap_pyfunction!(add_rows, m)?)?;
-    m.add_function(wrap_pyfunction!(add_pulls, m)?)?;
-    m.add_function(wrap_pyfunction!(all_below, m)?)?;
-    m.add_function(wrap_pyfunction!(add_harmonics, m)?)
-}
 
 /// A scalar type with buffers that last as long as the calling thread, so that a step allocates none.
 trait Buffered: Real + Element {
@@ -43,123 +34,60 @@ macro_rules! buffered {
 buffered!(f32);
 buffered!(f64);
 
-/// Call `$function::<T, Y>` for the dtypes of a render (f32 or f64) and of its target (u8 or the render's).
+/// Do the body with `$T` and `$Y` as the types of a render (f32 or f64) and of its target (u8 or the render's).
 macro_rules! by_dtypes {
-    ($name:literal, $render:expr, $target:expr, $function:ident($($argument:expr),*)) => {
-        match (is_f32($name, $render)?, $target.cast::<PyArrayDyn<u8>>().is_ok()) {
-            (true, true) => $function::<f32, u8>($($argument),*),
-            (true, false) => $function::<f32, f32>($($argument),*),
-            (false, true) => $function::<f64, u8>($($argument),*),
-            (false, false) => $function::<f64, f64>($($argument),*),
-        }
-    };
-}
-
-/// Two images [H, W, C] and a mask [H, W].
-struct Images<'py, T: Element, Y: Element> {
-    x: Array<'py, T>,
-    y: Array<'py, Y>,
-    mask: Option<Array<'py, u8>>,
-}
-
-impl<'py, T: Element, Y: Element> Images<'py, T, Y> {
-    fn new(
-        [x_name, y_name]: [&'static str; 2],
-        x: &Bound<'py, PyAny>,
-        y: &Bound<'py, PyAny>,
-        mask: Option<&Bound<'py, PyAny>>,
-    ) -> BindingResult<Self> {
-        let x = Array::new(x_name, x)?;
-        let shape = x.shape();
-        if shape.len() != 3 {
-            return Err(Error::shape(x_name, "[H, W, C]", format!("{shape:?}")).into());
-        }
-        let y = Array::new(y_name, y)?.of_shape(shape)?;
-        let mask = optional_of_shape("mask", mask, &shape[..2])?;
-        Ok(Self { x, y, mask })
-    }
-
-    fn borrow(&self) -> BindingResult<loss::Images<'_, T, Y>> {
-        let &[h, w, c] = self.x.shape() else {
-            unreachable!("checked above")
-        };
-        Ok(loss::Images {
-            render: self.x.slice()?,
-            target: self.y.slice()?,
-            mask: self.mask.as_ref().map(Array::slice).transpose()?,
-            size: [h, w, c],
+    ($T:ident, $Y:ident, $name:literal, $render:expr, $target:expr, $body:block) => {
+        by_dtype!($T, $name, $render, {
+            if $target.cast::<PyArrayDyn<u8>>().is_ok() {
+                type $Y = u8;
+                $body
+            } else {
+                type $Y = $T;
+                $body
+            }
         })
-    }
+    };
 }
 
 type Loss<'py> = (f64, f64, Option<f64>, Option<Bound<'py, PyAny>>);
 
 /// `loss::photometric`: (loss, L1, SSIM or None if `lambda_dssim` is 0, flat gradient or None).
 #[pyfunction]
-fn photometric<'py>(
+pub(crate) fn photometric<'py>(
     render: &Bound<'py, PyAny>,
     target: &Bound<'py, PyAny>,
-    mask: Option<&Bound<'py, PyAny>>,
-    lambda_dssim: f64,
-    knee: f64,
-    want_grad: bool,
-) -> BindingResult<Loss<'py>> {
-    by_dtypes!(
-        "render",
-        render,
-        target,
-        photometric_as(render, target, mask, lambda_dssim, knee, want_grad)
-    )
-}
-
-fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
-    render: &Bound<'py, PyAny>,
-    target: &Bound<'py, PyAny>,
-    mask: Option<&Bound<'py, PyAny>>,
+    mask: Optional<'_, 'py>,
     lambda_dssim: f64,
     knee: f64,
     want_grad: bool,
 ) -> BindingResult<Loss<'py>> {
     let py = render.py();
-    let images = Images::<T, Y>::new(["render", "target"], render, target, mask)?;
-    let images = images.borrow()?;
-    let options = LossOptions {
-        lambda: lambda_dssim,
-        knee,
-    };
-    let mut grad = gradient::<T>(images.render.len(), want_grad)?;
-    let out = want_grad.then_some(&mut grad[..]);
-    let value = py.detach(|| {
-        T::with_scratch(|scratch| {
-            threads::install(|| loss::photometric(images, &options, out, scratch))
-        })
-    })??;
-    let grad = want_grad.then(|| grad.into_pyarray(py).into_any());
-    Ok((value.loss, value.l1, value.ssim, grad))
-}
-
-/// `loss::ssim`.
-#[pyfunction]
-#[pyo3(signature = (a, b, mask = None))]
-fn ssim(
-    a: &Bound<'_, PyAny>,
-    b: &Bound<'_, PyAny>,
-    mask: Option<&Bound<'_, PyAny>>,
-) -> BindingResult<f64> {
-    by_dtypes!("a", a, b, ssim_as(a, b, mask))
-}
-
-fn ssim_as<'py, T: Buffered, Y: Sample<T> + Element>(
-    a: &Bound<'py, PyAny>,
-    b: &Bound<'py, PyAny>,
-    mask: Option<&Bound<'py, PyAny>>,
-) -> BindingResult<f64> {
-    let images = Images::<T, Y>::new(["a", "b"], a, b, mask)?;
-    let images = images.borrow()?;
-    let value = a
-        .py()
-        .detach(|| T::with_scratch(|scratch| threads::install(|| loss::ssim(images, scratch))))?;
-    Ok(value.map_err(|e| e.renamed("render", "a").renamed("target", "b"))?)
+    by_dtypes!(T, Y, "render", render, target, {
+        let render = Array::<T>::new("render", render)?;
+        let &[height, width, channels] = render.shape() else {
+            let got = format!("{:?}", render.shape());
+            return Err(Error::shape("render", "[H, W, C]", got).into());
+        };
+        let target = Array::<Y>::new("target", target)?.of_shape(render.shape())?;
+        let mask = optional_of_shape("mask", mask, &[height, width])?;
+        let images = Images {
+            render: render.slice(),
+            target: target.slice(),
+            mask: mask.as_ref().map(Array::slice),
+            size: [height, width, channels],
+        };
+        let options = LossOptions {
+            lambda: lambda_dssim,
+            knee,
+        };
+        let mut grad = gradient::<T>(py, images.render.len(), want_grad)?;
+        let out = want_grad.then_some(&mut grad[..]);
+        let value = T::with_scratch(|scratch| {
+            threads::run(py, || loss::photometric(images, &options, out, scratch))
+        })?;
+        let grad = want_grad.then(|| grad.into_pyarray(py).into_any());
+        Ok((value.loss, value.l1, value.ssim, grad))
+    })
 }
 
 /// `(param, grad, exp_avg, exp_avg_sq, step, (lr, beta1, beta2, eps), used)`
@@ -176,7 +104,7 @@ type StepOf<'py> = (
 /// `adam::steps`, in place on `param`, `exp_avg` and `exp_avg_sq` of each. `used`: of parameters [N, K, ...] the first
 /// so many of the K alone are updated.
 #[pyfunction]
-fn adam_steps(py: Python<'_>, steps: Vec<StepOf<'_>>) -> BindingResult<()> {
+pub(crate) fn adam_steps(py: Python<'_>, steps: Vec<StepOf<'_>>) -> BindingResult<()> {
     let (mut single, mut double) = (Vec::new(), Vec::new());
     for step in &steps {
         if is_f32("param", &step.0)? {
@@ -185,21 +113,13 @@ fn adam_steps(py: Python<'_>, steps: Vec<StepOf<'_>>) -> BindingResult<()> {
             double.push(HeldStep::<f64>::new(step)?);
         }
     }
-    let single = single
-        .iter_mut()
-        .map(HeldStep::borrow)
-        .collect::<BindingResult<Vec<_>>>()?;
-    let double = double
-        .iter_mut()
-        .map(HeldStep::borrow)
-        .collect::<BindingResult<Vec<_>>>()?;
-    Ok(py.detach(|| {
-        threads::install(|| {
-            adam::check(&single)?;
-            adam::check(&double)?;
-            adam::steps(single).and_then(|()| adam::steps(double))
-        })
-    })??)
+    let single: Vec<_> = single.iter_mut().map(HeldStep::borrow).collect();
+    let double: Vec<_> = double.iter_mut().map(HeldStep::borrow).collect();
+    threads::run(py, || {
+        adam::check(&single)?;
+        adam::check(&double)?;
+        adam::steps(single).and_then(|()| adam::steps(double))
+    })
 }
 
 /// The borrowed arrays of a step.
@@ -244,56 +164,47 @@ impl<'py, T: Real + Element> HeldStep<'py, T> {
         })
     }
 
-    fn borrow(&mut self) -> BindingResult<AdamStep<'_, T>> {
-        Ok(AdamStep {
+    fn borrow(&mut self) -> AdamStep<'_, T> {
+        AdamStep {
             arrays: AdamArrays {
-                param: self.param.slice()?,
-                grad: self.grad.slice()?,
-                exp_avg: self.exp_avg.slice()?,
-                exp_avg_sq: self.exp_avg_sq.slice()?,
+                param: self.param.slice(),
+                grad: self.grad.slice(),
+                exp_avg: self.exp_avg.slice(),
+                exp_avg_sq: self.exp_avg_sq.slice(),
             },
             step: self.step,
             options: self.options,
             selection: self.selection,
-        })
+        }
     }
 }
 
 /// See [`views::add`]: `(rows [M] i32, values [M, W] f32)` of each view are added to `sums [N, W]`, f32.
 #[pyfunction]
-fn add_rows(
+pub(crate) fn add_rows(
+    py: Python<'_>,
     views: Vec<(Bound<'_, PyAny>, Bound<'_, PyAny>)>,
     sums: &Bound<'_, PyAny>,
     scale: f32,
 ) -> BindingResult<()> {
-    let mut held = ArrayMut::<f32>::new("sums", sums)?;
-    let &[_, width] = held.shape() else {
-        let got = format!("{:?}", held.shape());
+    let mut sums = ArrayMut::<f32>::new("sums", sums)?;
+    let &[_, width] = sums.shape() else {
+        let got = format!("{:?}", sums.shape());
         return Err(Error::shape("sums", "[N, W]", got).into());
     };
     let views = views
         .iter()
-        .map(|(rows, values)| rows_of("values", rows, values, width))
+        .map(|(rows, values)| HeldRows::new("values", rows, values, width))
         .collect::<BindingResult<Vec<_>>>()?;
-    let views = views
-        .iter()
-        .map(|(rows, values)| {
-            Ok(ViewRows {
-                rows: rows.slice()?,
-                values: values.slice()?,
-            })
-        })
-        .collect::<BindingResult<Vec<_>>>()?;
-    let target = held.slice()?;
-    Ok(sums
-        .py()
-        .detach(|| threads::install(|| views::add(&views, target, width, scale)))??)
+    let views: Vec<_> = views.iter().map(HeldRows::borrow).collect();
+    let sums = sums.slice();
+    threads::run(py, || views::add(&views, sums, width, scale))
 }
 
 /// See [`Pulls::add`]: the `gradient [N, 2]` of one view is added to `sums [N]` and `views [N]`, all f32, where `radii
 /// [N, 2] i32` are not 0.
 #[pyfunction]
-fn add_pulls(
+pub(crate) fn add_pulls(
     sums: &Bound<'_, PyAny>,
     views: &Bound<'_, PyAny>,
     gradient: &Bound<'_, PyAny>,
@@ -306,16 +217,19 @@ fn add_pulls(
     let mut sums = ArrayMut::<f32>::new("sums", sums)?.of_shape(&[n])?;
     let mut views = ArrayMut::<f32>::new("views", views)?.of_shape(&[n])?;
     let mut pulls = Pulls {
-        sums: sums.slice()?,
-        views: views.slice()?,
+        sums: sums.slice(),
+        views: views.slice(),
     };
-    let (gradient, radii) = (gradient.slice()?, radii.slice()?);
-    Ok(py.detach(|| threads::install(|| pulls.add(gradient, radii, half)))??)
+    let (gradient, radii) = (gradient.slice(), radii.slice());
+    threads::run(py, || pulls.add(gradient, radii, half))
 }
 
 /// See [`growth::all_below`]: of several arrays, f32 or f64, each with its limit.
 #[pyfunction]
-fn all_below(py: Python<'_>, arrays: Vec<(Bound<'_, PyAny>, f64)>) -> BindingResult<bool> {
+pub(crate) fn all_below(
+    py: Python<'_>,
+    arrays: Vec<(Bound<'_, PyAny>, f64)>,
+) -> BindingResult<bool> {
     let (mut single, mut double) = (Vec::new(), Vec::new());
     for (array, limit) in &arrays {
         if is_f32("arrays", array)? {
@@ -324,14 +238,16 @@ fn all_below(py: Python<'_>, arrays: Vec<(Bound<'_, PyAny>, f64)>) -> BindingRes
             double.push((Array::<f64>::new("arrays", array)?, *limit));
         }
     }
-    let (single, double) = (slices(&single)?, slices(&double)?);
-    py.detach(|| threads::install(|| growth::all_below(&single) && growth::all_below(&double)))
+    let (single, double) = (slices(&single), slices(&double));
+    threads::run(py, || {
+        Ok(growth::all_below(&single) && growth::all_below(&double))
+    })
 }
 
-fn slices<'a, T: Element>(arrays: &'a [(Array<'_, T>, f64)]) -> BindingResult<Vec<(&'a [T], f64)>> {
+fn slices<'a, T: Element>(arrays: &'a [(Array<'_, T>, f64)]) -> Vec<(&'a [T], f64)> {
+    let arrays = arrays.iter();
     arrays
-        .iter()
-        .map(|(array, limit)| Ok((array.slice()?, *limit)))
+        .map(|(array, limit)| (array.slice(), *limit))
         .collect()
 }
 
@@ -340,49 +256,56 @@ type ColorsOfView<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>, [f64; 3], usize)
 
 /// See [`views::add_harmonics`]. Everything but the rows' numbers is f32.
 #[pyfunction]
-fn add_harmonics(
+pub(crate) fn add_harmonics(
+    py: Python<'_>,
     views: Vec<ColorsOfView<'_>>,
     means: &Bound<'_, PyAny>,
     high: &Bound<'_, PyAny>,
     scale: f32,
 ) -> BindingResult<()> {
-    let (means_of, n) = Array::<f32>::new("means", means)?.of_width(3)?;
+    let (means, n) = Array::<f32>::new("means", means)?.of_width(3)?;
     let high = ArrayMut::<f32>::new("high", high)?;
     let coefficients = high.shape().get(1).copied().unwrap_or(0);
     let mut high = high.of_shape(&[n, coefficients, 3])?;
     let held = views
         .iter()
-        .map(|(rows, colors, center, degree)| {
-            Ok((rows_of("colors", rows, colors, 3)?, *center, *degree))
-        })
+        .map(|(rows, colors, ..)| HeldRows::new("colors", rows, colors, 3))
         .collect::<BindingResult<Vec<_>>>()?;
-    let views = held
+    let views: Vec<_> = held
         .iter()
-        .map(|((rows, colors), center, degree)| {
-            let colors = ViewRows {
-                rows: rows.slice()?,
-                values: colors.slice()?,
-            };
-            Ok(ViewColors {
-                colors,
-                center: *center,
-                degree: *degree,
-            })
+        .zip(&views)
+        .map(|(colors, &(_, _, center, degree))| ViewColors {
+            colors: colors.borrow(),
+            center,
+            degree,
         })
-        .collect::<BindingResult<Vec<_>>>()?;
-    let (high, means_of) = (high.slice()?, means_of.slice()?);
-    Ok(means
-        .py()
-        .detach(|| threads::install(|| views::add_harmonics(&views, means_of, high, scale)))??)
+        .collect();
+    let (means, high) = (means.slice(), high.slice());
+    threads::run(py, || views::add_harmonics(&views, means, high, scale))
 }
 
-/// The numbers `[M, width]` of a view's rows `[M]`.
-fn rows_of<'py>(
-    name: &'static str,
-    rows: &Bound<'py, PyAny>,
-    values: &Bound<'py, PyAny>,
-    width: usize,
-) -> BindingResult<(Array<'py, i32>, Array<'py, f32>)> {
-    let (values, m) = Array::<f32>::new(name, values)?.of_width(width)?;
-    Ok((Array::<i32>::new("rows", rows)?.of_shape(&[m])?, values))
+/// The borrowed rows `[M]` of a view, and the numbers `[M, width]` that it has for them.
+struct HeldRows<'py> {
+    rows: Array<'py, i32>,
+    values: Array<'py, f32>,
+}
+
+impl<'py> HeldRows<'py> {
+    fn new(
+        name: &'static str,
+        rows: &Bound<'py, PyAny>,
+        values: &Bound<'py, PyAny>,
+        width: usize,
+    ) -> BindingResult<Self> {
+        let (values, m) = Array::<f32>::new(name, values)?.of_width(width)?;
+        let rows = Array::<i32>::new("rows", rows)?.of_shape(&[m])?;
+        Ok(Self { rows, values })
+    }
+
+    fn borrow(&self) -> ViewRows<'_> {
+        ViewRows {
+            rows: self.rows.slice(),
+            values: self.values.slice(),
+        }
+    }
 }

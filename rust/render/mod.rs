@@ -148,29 +148,6 @@ pub fn forward<'a, T: Real>(
     })
 }
 
-/// The image of [`forward`] in 8 bits, [H, W, channels], 1 as 255, rounded half to even: faster, and with no way back.
-///
-/// # Errors
-/// As for [`forward`].
-pub fn picture<T: Real>(
-    gaussians: Gaussians<'_, T>,
-    colors: Colors<'_, T>,
-    background: Option<&[T]>,
-    camera: &Camera,
-    options: &RenderOptions,
-) -> Result<Vec<u8>, Error> {
-    let options = RenderOptions {
-        differentiable: false,
-        ..*options
-    };
-    let projected = project::forward(&gaussians, colors, camera, &options, false)?;
-    let (given, channels) = match colors {
-        Colors::Harmonics(_) => (&projected.colors[..], 3),
-        Colors::Channels(data, channels) => (data, channels),
-    };
-    composite::picture(&projected.projection, given, channels, camera, background)
-}
-
 /// Gradients of a loss, from its gradients `v` with respect to the image and the alphas.
 ///
 /// # Errors

@@ -356,14 +356,17 @@ fn a_picture_is_the_image_in_8_bits() {
                 (Colors::Channels(&given, channels), None)
             };
             let image = forward(gaussians, colors, behind, &s.camera, &options).unwrap();
-            let bytes = picture(gaussians, colors, behind, &s.camera, &options).unwrap();
+            let (projection, channels) = (&image.projection, colors.channels());
+            let projected = project::forward(&gaussians, colors, &s.camera, &options, false);
+            let shaded = projected.unwrap().colors;
+            let given = if channels == 3 { &shaded } else { &given };
+            let picture =
+                |behind| composite::picture(projection, given, channels, &s.camera, behind);
+            let bytes = picture(behind).unwrap();
             let level = |x: &f32| (x * 255.0).round_ties_even().clamp(0.0, 255.0) as u8;
             assert_eq!(bytes, image.image.iter().map(level).collect::<Vec<_>>());
+            assert_eq!(picture(Some(&[0.0])).unwrap_err().name(), "background");
         }
-        let s = &s;
-        let colors = Colors::Harmonics(harmonics(s));
-        let error = picture(s.gaussians(), colors, Some(&[0.0]), &s.camera, &options);
-        assert_eq!(error.unwrap_err().name(), "background");
     });
 }
 

@@ -1,10 +1,10 @@
 //! The binding of the projection's vector-Jacobian product.
 
 use super::{Arrays, Frame};
-use crate::threads;
 use crate::{
     arrays::{Array, CountsByName, Scalar, by_dtype, join, of_type, optional_of_shape},
     error::BindingResult,
+    threads,
 };
 use hqgs::internals::{
     Error,
@@ -14,22 +14,6 @@ use hqgs::internals::{
 use numpy::IntoPyArray;
 use pyo3::{IntoPyObjectExt, prelude::*};
 use std::{array, mem};
-
-/// VJP of `project_forward`. `inputs`: means, quats, scales, opacities; `cotangents` as in [`COTANGENTS`]; `wanted`:
-/// means, quats, scales, opacities, covariances, harmonics, their rest, and the cameras.
-#[pyfunction]
-pub(super) fn project_backward<'py>(
-    frame: &Bound<'py, Frame>,
-    inputs: [Bound<'py, PyAny>; 4],
-    cotangents: [Option<Bound<'py, PyAny>>; 6],
-    wanted: [bool; 8],
-) -> BindingResult<Bound<'py, PyAny>> {
-    by_dtype!(
-        "means",
-        &inputs[0],
-        project_backward_as(frame, &inputs, &cotangents, wanted)
-    )
-}
 
 /// What the cotangents are called, and how many numbers each Gaussian has of them.
 const COTANGENTS: [(&str, usize); 6] = [
@@ -80,44 +64,17 @@ fn add<T: Real>(sums: &mut GaussianGrads<T>, mut grads: GaussianGrads<T>) {
     sums.counts = sums.counts.plus(grads.counts);
 }
 
-fn project_backward_as<'py, T: Scalar>(
+/// VJP of `project_forward`. `inputs`: means, quats, scales, opacities; `cotangents` as in [`COTANGENTS`]; `wanted`:
+/// means, quats, scales, opacities, covariances, harmonics, their rest, and the cameras.
+#[pyfunction]
+pub(crate) fn project_backward<'py>(
     frame: &Bound<'py, Frame>,
-    inputs: &[Bound<'py, PyAny>; 4],
-    cotangents: &[Option<Bound<'py, PyAny>>],
+    inputs: [Bound<'py, PyAny>; 4],
+    cotangents: [Option<Bound<'py, PyAny>>; 6],
     wanted: [bool; 8],
 ) -> BindingResult<Bound<'py, PyAny>> {
-    let py = frame.py();
-    let frame = &frame.get().0;
-    let arrays = Arrays::<T>::new(inputs.each_ref())?;
-    let gaussians = arrays.gaussians()?;
-    let shadings = of_type::<Vec<Option<Shading<T>>>>(&frame.shadings, "means")?;
+    let (py, frame) = (frame.py(), &frame.get().0);
     let (n, c) = (frame.n, frame.cameras.len());
-    if gaussians.len() != n {
-        let (expected, got) = (format!("[{n}, 3]"), format!("[{}, 3]", gaussians.len()));
-        return Err(Error::shape("means", expected, got).into());
-    }
-    let held = cotangent_arrays::<T>(cotangents, c, n)?;
-    let slices = held
-        .iter()
-        .map(|v| v.as_ref().map(Array::slice).transpose());
-    let slices = slices.collect::<BindingResult<Vec<_>>>()?;
-    if slices[5].is_some() && shadings.iter().any(Option::is_none) {
-        return Err(Error::new("v_colors", "the forward pass was not to be differentiated").into());
-    }
-    let cotangents_of = |camera: usize| {
-        let part = |k: usize| {
-            let len = COTANGENTS[k].1 * n;
-            slices[k].map(|v| &v[camera * len..(camera + 1) * len])
-        };
-        ProjectCotangents {
-            means2d: part(0),
-            whitened: part(1),
-            opacities: part(2),
-            depths: part(3),
-            conics: part(4),
-            colors: part(5),
-        }
-    };
     let asked = project::Wanted {
         means: wanted[0],
         quats: wanted[1],
@@ -128,8 +85,31 @@ fn project_backward_as<'py, T: Scalar>(
         harmonics_rest: wanted[6],
         camera: wanted[7],
     };
-    let (sums, viewmats, mut of_each) = py.detach(|| {
-        threads::install(|| -> Result<_, Error> {
+    by_dtype!(T, "means", &inputs[0], {
+        let arrays = Arrays::<T>::new(inputs.each_ref())?;
+        let gaussians = arrays.gaussians();
+        let shadings = of_type::<Vec<Option<Shading<T>>>>(&frame.shadings, "means")?;
+        if gaussians.len() != n {
+            let (expected, got) = (format!("[{n}, 3]"), format!("[{}, 3]", gaussians.len()));
+            return Err(Error::shape("means", expected, got).into());
+        }
+        let held = cotangent_arrays::<T>(&cotangents, c, n)?;
+        let slices: Vec<_> = held.iter().map(|v| v.as_ref().map(Array::slice)).collect();
+        let cotangents_of = |camera: usize| {
+            let part = |k: usize| {
+                let len = COTANGENTS[k].1 * n;
+                slices[k].map(|v| &v[camera * len..(camera + 1) * len])
+            };
+            ProjectCotangents {
+                means2d: part(0),
+                whitened: part(1),
+                opacities: part(2),
+                depths: part(3),
+                conics: part(4),
+                colors: part(5),
+            }
+        };
+        let (sums, viewmats, mut of_each) = threads::run(py, || {
             let mut sums: Option<GaussianGrads<T>> = None;
             let (mut viewmats, mut of_each) = (Vec::with_capacity(16 * c), Vec::new());
             for (i, camera) in frame.cameras.iter().enumerate() {
@@ -152,16 +132,16 @@ fn project_backward_as<'py, T: Scalar>(
                 }
             }
             Ok((sums, viewmats, of_each))
-        })
-    })??;
-    let mut grads = sums.ok_or_else(|| Error::new("viewmats", "there is no camera"))?;
-    if frame.harmonics_of_each {
-        grads.harmonics = join(&mut of_each, |harmonics| harmonics)?;
-    }
-    let counts: CountsByName = grads.counts.entries().collect();
-    let mut arrays = arrays_of(&mut grads);
-    let [a, b, c, d, e, f, g] =
-        array::from_fn(|k| wanted[k].then(|| mem::take(arrays[k]).into_pyarray(py)));
-    let viewmats = wanted[7].then(|| viewmats.into_pyarray(py));
-    Ok((a, b, c, d, e, f, g, viewmats, counts).into_bound_py_any(py)?)
+        })?;
+        let mut grads = sums.ok_or_else(|| Error::new("viewmats", "there is no camera"))?;
+        if frame.harmonics_of_each {
+            grads.harmonics = join(&mut of_each, |harmonics| harmonics)?;
+        }
+        let counts: CountsByName = grads.counts.entries().collect();
+        let mut arrays = arrays_of(&mut grads);
+        let [a, b, c, d, e, f, g] =
+            array::from_fn(|k| wanted[k].then(|| mem::take(arrays[k]).into_pyarray(py)));
+        let viewmats = wanted[7].then(|| viewmats.into_pyarray(py));
+        Ok((a, b, c, d, e, f, g, viewmats, counts).into_bound_py_any(py)?)
+    })
 }

@@ -1,14 +1,13 @@
 //! The binding of the projection.
 
-mod backward;
-mod forward;
+pub(crate) mod backward;
+pub(crate) mod forward;
 
 use crate::{
     arrays::{AnyType, Array, CountsByName, Scalar},
     error::BindingResult,
 };
 use hqgs::internals::{
-    Error,
     counts::Counts,
     project::{Projection, RenderOptions},
     scene::{Camera, Gaussians},
@@ -16,14 +15,6 @@ use hqgs::internals::{
 use numpy::Element;
 use pyo3::prelude::*;
 use std::sync::Arc;
-
-/// Add the functions and classes of this file to the module.
-pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_class::<Frame>()?;
-    m.add_function(wrap_pyfunction!(forward::project_forward, m)?)?;
-    m.add_function(wrap_pyfunction!(forward::pictures, m)?)?;
-    m.add_function(wrap_pyfunction!(backward::project_backward, m)?)
-}
 
 /// The projection of N Gaussians into C cameras.
 #[pyclass(frozen, module = "hqgs._rust")]
@@ -42,18 +33,26 @@ pub(crate) struct Projections {
     counts: Counts,
 }
 
+impl Projections {
+    /// Width and height of the images.
+    pub(crate) fn size(&self) -> [usize; 2] {
+        let first = self.cameras.first();
+        first.map_or([0; 2], |camera| [camera.width(), camera.height()])
+    }
+}
+
 #[pymethods]
 impl Frame {
     /// Image width in pixels.
     #[getter]
     fn width(&self) -> usize {
-        self.0.cameras.first().map_or(0, |c| c.width())
+        self.0.size()[0]
     }
 
     /// Image height in pixels.
     #[getter]
     fn height(&self) -> usize {
-        self.0.cameras.first().map_or(0, |c| c.height())
+        self.0.size()[1]
     }
 
     /// Counts of the projection.
@@ -83,30 +82,12 @@ impl<'py, T: Scalar> Arrays<'py, T> {
         })
     }
 
-    fn gaussians(&self) -> BindingResult<Gaussians<'_, T>> {
-        let gaussians = Gaussians {
-            means: self.means.slice()?,
-            quats: self.quats.slice()?,
-            scales: self.scales.slice()?,
-            opacities: self.opacities.slice()?,
-        };
-        gaussians.check()?;
-        Ok(gaussians)
-    }
-}
-
-/// Colours as channels, one set for all cameras or one each: the data and the number of channels.
-pub(crate) fn channels_of<'a, T: Scalar>(
-    colors: &'a Array<'_, T>,
-    n: usize,
-    cameras: usize,
-) -> BindingResult<(&'a [T], usize)> {
-    match *colors.shape() {
-        [given, channels] if given == n => Ok((colors.slice()?, channels)),
-        [c, given, channels] if (c, given) == (cameras, n) => Ok((colors.slice()?, channels)),
-        ref shape => {
-            let expected = format!("[{n}, D] or [{cameras}, {n}, D]");
-            Err(Error::shape("colors", expected, format!("{shape:?}")).into())
+    fn gaussians(&self) -> Gaussians<'_, T> {
+        Gaussians {
+            means: self.means.slice(),
+            quats: self.quats.slice(),
+            scales: self.scales.slice(),
+            opacities: self.opacities.slice(),
         }
     }
 }

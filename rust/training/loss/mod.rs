@@ -70,7 +70,7 @@ pub struct Photometric {
     pub ssim: Option<f64>,
 }
 
-/// Buffers that [`photometric`] and [`ssim`] reuse from call to call.
+/// Buffers that [`photometric`] reuses from call to call.
 #[derive(Debug, Default)]
 pub struct LossScratch<T> {
     sums: Vec<RowSums>,
@@ -184,25 +184,6 @@ pub fn photometric<T: Real, Y: Sample<T>>(
         l1,
         ssim: Some(1.0 - dissimilarity),
     })
-}
-
-/// Mean SSIM of a render; for the mask see [`photometric`].
-///
-/// # Errors
-/// Names the array whose length does not match.
-pub fn ssim<T: Real, Y: Sample<T>>(
-    images: Images<'_, T, Y>,
-    scratch: &mut LossScratch<T>,
-) -> Result<f64, Error> {
-    images.check()?;
-    let plan = Plan {
-        ssim: true,
-        knee: 0.0,
-        l1_scale: 0.0,
-        ssim_scale: 0.0,
-    };
-    let sums = run(images, plan, None, scratch)?;
-    Ok(1.0 - sums.dissimilarity / images.render.len() as f64)
 }
 
 impl<T, Y> Images<'_, T, Y> {
