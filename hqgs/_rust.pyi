@@ -24,7 +24,7 @@ class Frame:
 
     width: int
     height: int
-    counts: dict[str, int]
+    projected: int
 
 class Composite:
     """Tile lists and replay state of a composited frame."""
@@ -32,7 +32,6 @@ class Composite:
     work: tuple[int, int, int]
     blended: int
     bin_seconds: float
-    counts: dict[str, int]
 
 class Separable:
     """A linear operator on pictures and its transpose."""
@@ -61,11 +60,8 @@ def project_forward(
     all: bool = True,
 ) -> tuple[Frame, Array, Array, Array, Array, Array, Array]: ...
 def project_backward(
-    frame: Frame,
-    inputs: tuple[Array, Array, Array, Array],
-    cotangents: tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe],
-    wanted: list[bool],
-) -> tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, dict[str, int]]: ...
+    frame: Frame, inputs: tuple[Array, Array, Array, Array], cotangents: tuple[Maybe, ...], wanted: list[bool]
+) -> tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, Maybe]: ...
 def composite_forward(
     frame: Frame, colors: Array, backgrounds: Array | None, channels: int
 ) -> tuple[Composite, Array, Array]: ...
@@ -76,7 +72,7 @@ def composite_backward(
     v_image: Array,
     v_alphas: Array | None,
     wanted: list[bool],
-) -> tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, dict[str, int]]: ...
+) -> tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe]: ...
 def photometric(
     render: Array, target: Array, mask: Array | None, lambda_dssim: float, knee: float, want_grad: bool
 ) -> tuple[float, float, float | None, Array | None]: ...
@@ -102,7 +98,6 @@ def adam_steps(
 def add_pulls(
     sums: Array, views: Array, gradient: Array, radii: Array, half: tuple[float, float]
 ) -> None: ...
-def all_below(arrays: list[tuple[Array, float]]) -> bool: ...
 def add_rows(views: list[tuple[Array, Array]], sums: Array, scale: float) -> None: ...
 def add_harmonics(
     views: list[tuple[Array, Array, list[float], int]], means: Array, high: Array, scale: float

@@ -14,26 +14,6 @@ pub enum Error {
         /// What was expected and what was got.
         message: String,
     },
-    /// An array has another shape than the other arguments ask for.
-    Shape {
-        /// The array, by its public name.
-        name: String,
-        /// The shape that would fit.
-        expected: String,
-        /// The shape that it has.
-        got: String,
-    },
-    /// The Gaussians reach more tiles than one view may hold.
-    TooManyPairs {
-        /// Gaussians of the view.
-        gaussians: u64,
-        /// Tiles of the image.
-        tiles: u64,
-        /// The most (Gaussian, tile) pairs that are allowed.
-        limit: u64,
-        /// What so many may take.
-        bytes: u64,
-    },
     /// The system does not give the memory that a buffer needs.
     OutOfMemory {
         /// What the buffer would have held.
@@ -52,20 +32,16 @@ impl Error {
         }
     }
 
-    /// [`Error::Shape`].
+    /// An array has another shape than the other arguments ask for.
     pub fn shape(name: &str, expected: impl fmt::Display, got: impl fmt::Display) -> Self {
-        Self::Shape {
-            name: name.into(),
-            expected: expected.to_string(),
-            got: got.to_string(),
-        }
+        Self::new(name, format!("expected shape {expected}, got {got}"))
     }
 
     /// The same of an argument that is called `other` where `name` stands.
     #[must_use]
     #[doc(hidden)]
     pub fn renamed(mut self, from: &str, to: &str) -> Self {
-        if let Self::InvalidArgument { name, .. } | Self::Shape { name, .. } = &mut self
+        if let Self::InvalidArgument { name, .. } = &mut self
             && name == from
         {
             *name = to.into();
@@ -76,10 +52,7 @@ impl Error {
     /// The argument or the resource that the message begins with.
     pub fn name(&self) -> &str {
         match self {
-            Self::InvalidArgument { name, .. }
-            | Self::Shape { name, .. }
-            | Self::OutOfMemory { name, .. } => name,
-            Self::TooManyPairs { .. } => "means",
+            Self::InvalidArgument { name, .. } | Self::OutOfMemory { name, .. } => name,
         }
     }
 }
@@ -89,19 +62,6 @@ impl fmt::Display for Error {
         write!(f, "{}: ", self.name())?;
         match self {
             Self::InvalidArgument { message, .. } => f.write_str(message),
-            Self::Shape { expected, got, .. } => {
-                write!(f, "expected shape {expected}, got {got}")
-            }
-            Self::TooManyPairs {
-                gaussians,
-                tiles,
-                limit,
-                bytes,
-            } => write!(
-                f,
-                "{gaussians} Gaussians reach more than {limit} times one of the {tiles} tiles of the image; so many \
-                 pairs take up to {bytes} bytes; use fewer or smaller Gaussians, a smaller image or float32"
-            ),
             Self::OutOfMemory { bytes, .. } => write!(f, "cannot allocate {bytes} bytes"),
         }
     }
@@ -136,16 +96,6 @@ mod tests {
             (
                 Error::shape("scales", "30 elements", "29 elements"),
                 "scales: expected shape 30 elements, got 29 elements",
-            ),
-            (
-                Error::TooManyPairs {
-                    gaussians: 9,
-                    tiles: 4,
-                    limit: 8,
-                    bytes: 800,
-                },
-                "means: 9 Gaussians reach more than 8 times one of the 4 tiles of the image; so many pairs take up \
-                 to 800 bytes; use fewer or smaller Gaussians, a smaller image or float32",
             ),
             (
                 Error::OutOfMemory {

@@ -60,7 +60,6 @@ mod tiles;
 
 mod accuracy_knobs;
 mod constants;
-mod counts;
 mod error;
 mod memory;
 mod simd;
@@ -81,7 +80,6 @@ pub mod internals {
         accuracy_knobs,
         composite,
         constants,
-        counts,
         memory,
         project,
         simd,

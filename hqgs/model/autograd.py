@@ -160,19 +160,9 @@ class _Project(torch.autograd.Function):
         needs = list(ctx.needs_input_grad[:8])
         if not ctx.has_harmonics:
             v_colors = None
-        *v_inputs, _ = _rust.project_backward(
-            ctx.frame,
-            (as_array(means), as_array(quats), as_array(scales), as_array(opacities)),
-            (
-                _optional(v_means2d),
-                _optional(v_link),
-                _optional(v_alphas),
-                _optional(v_depths),
-                _optional(v_conics),
-                _optional(v_colors),
-            ),
-            needs,
-        )
+        cotangents = v_means2d, v_link, v_alphas, v_depths, v_conics, v_colors
+        inputs = as_array(means), as_array(quats), as_array(scales), as_array(opacities)
+        v_inputs = [*_rust.project_backward(ctx.frame, inputs, tuple(map(_optional, cotangents)), needs)[:8]]
         if v_inputs[7] is not None:  # computed in f64; stay finite in the dtype of the inputs
             limit = torch.finfo(means.dtype).max
             v_inputs[7].clip(-limit, limit, out=v_inputs[7])
@@ -233,7 +223,7 @@ class _Composite(torch.autograd.Function):
         need_colors, need_depths = need_colors and "RGB" in ctx.mode, need_depths and ctx.mode != "RGB"
         need_backgrounds = need_backgrounds and ctx.behind is not None
         wanted = [geometry, ctx.absgrad, need_colors or need_depths, need_backgrounds]
-        *v_inputs, _ = _rust.composite_backward(ctx.state, ctx.behind, v_image, v_alphas, wanted)
+        v_inputs = _rust.composite_backward(ctx.state, ctx.behind, v_image, v_alphas, wanted)[:6]
         v_means2d, v_link, v_alphas_in, v_abs, v_colors, v_backgrounds = v_inputs
         v_means2d, v_packed = _tensor(v_means2d, c, n, 2), None
         v_abs = _tensor(v_abs, c, n, 2)

@@ -109,7 +109,7 @@ class Pairs:
     def __init__(self, scenes: Sequence[dict[str, Any]]) -> None:
         self._radii: list[Tensor] = [splats["radii"] for splats in scenes]
         self.shape: torch.Size = self._radii[0].shape[:2]
-        self.counts: list[int] = [splats["frame"].counts["projected"] for splats in scenes]
+        self.counts: list[int] = [splats["frame"].projected for splats in scenes]
         self.asked: bool = False  # for `means2d`
 
     @cached_property

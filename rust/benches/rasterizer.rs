@@ -11,7 +11,6 @@ use hqgs::{
         composite::{self, CompositeCotangents, CompositeInput},
         project::{self, ProjectCotangents, Projected, RenderOptions},
         scene::{self, Colors, Harmonics},
-        tiles,
     },
 };
 use std::time::Duration;
@@ -66,9 +65,6 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
         shading,
         ..
     } = project();
-    group.bench_function(BenchmarkId::new("bin and order", n), |b| {
-        b.iter(|| tiles::bin(&projection, &colors, 3, &s.camera).expect("few pairs"));
-    });
     let pixels = s.camera.width() * s.camera.height();
     let composite =
         || composite::forward(&projection, &colors, 3, &s.camera, None).expect("few pairs");
@@ -82,7 +78,7 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
         camera: &s.camera,
         background: None,
     };
-    println!("{name}, {n} Gaussians: {:?}", view.counts);
+    println!("{name}, {n} Gaussians: {:?}", view.work);
     let v_image: Vec<f32> = (0..3 * pixels).map(|i| (i as f32 * 0.37).sin()).collect();
     let v = CompositeCotangents {
         image: &v_image,

@@ -7,7 +7,6 @@ use super::{
 };
 use crate::{
     constants::{BLOCK, BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
-    counts::Counts,
     error::{Error, check_len},
     memory::{self, OfThreads},
     simd::{Real, groups::Column, sums},
@@ -57,12 +56,10 @@ pub struct CompositeGrads<T> {
     pub colors: Vec<T>,
     /// Of `background`, `[channels]`.
     pub background: Vec<T>,
-    /// Counts.
-    pub counts: Counts,
 }
 
 /// VJP of [`forward()`](super::forward()). Tiles and blocks whose pixels have no cotangent that is not 0 are left
-/// out.
+/// out. The input is that of `forward`, which made `composited`.
 ///
 /// # Errors
 /// When the length of an array does not fit.
@@ -72,10 +69,11 @@ pub fn backward<T: Real>(
     v: &CompositeCotangents<T>,
     wanted: Wanted,
 ) -> Result<CompositeGrads<T>, Error> {
-    input.check()?;
     let (channels, tiles) = (input.channels(), input.tiles);
-    check_len("composited", &composited.depths, tiles.lists.len())?;
     check_len("v.image", v.image, input.pixels() * channels)?;
+    if let Some(background) = input.background {
+        check_len("background", background, channels)?;
+    }
     if let Some(alphas) = v.alphas {
         check_len("v.alphas", alphas, input.pixels())?;
     }
@@ -97,14 +95,12 @@ pub fn backward<T: Real>(
     let (grid, scratch) = (Grid::new(), OfThreads::<Scratch<T>>::default());
     let count = tiles.lists.len();
     let mut pair_grads = memory::filled(Vec::new(), count, NAME)?;
-    let mut counts = memory::filled(Counts::default(), count, NAME)?;
     pair_grads
         .par_iter_mut()
-        .zip(&mut counts)
         .enumerate()
         .with_max_len(TOGETHER)
-        .try_for_each(|(tile, (grads, counts))| -> Result<(), Error> {
-            (*grads, *counts) = scratch.with(|scratch| {
+        .try_for_each(|(tile, grads)| -> Result<(), Error> {
+            *grads = scratch.with(|scratch| {
                 backward_tile(input, composited, v, &grid, tile, layout, scratch)
             })?;
             Ok(())
@@ -113,7 +109,6 @@ pub fn backward<T: Real>(
     pair_grads.into_par_iter().for_each(drop); // to free them takes a while, too
     Ok(CompositeGrads {
         background,
-        counts: counts.into_iter().fold(Counts::default(), Counts::plus),
         ..gradients
     })
 }
@@ -126,7 +121,7 @@ struct Scratch<T: Real> {
     layers: Vec<Layer<T>>,
 }
 
-/// Gradients of a tile's pairs, by index, and the work that they took; empty if all are zero. Each of the three steps
+/// Gradients of a tile's pairs, by index; empty if all are zero. Each of the three steps
 /// is compiled by itself: together they are too much for what the compiler keeps in registers.
 fn backward_tile<T: Real>(
     input: &CompositeInput<T>,
@@ -136,31 +131,27 @@ fn backward_tile<T: Real>(
     tile: usize,
     layout: PairLayout,
     scratch: &mut Scratch<T>,
-) -> Result<(Vec<T>, Counts), Error> {
-    let mut counts = Counts::default();
+) -> Result<Vec<T>, Error> {
     let list = &input.tiles.lists[tile];
     if list.records.is_empty() {
-        return Ok((Vec::new(), counts));
+        return Ok(Vec::new());
     }
     let (channels, level) = (layout.channels, input.projection.level.token);
     let Scratch { adjoint, layers } = scratch;
     adjoint.make_room(channels)?;
     let wanted = dispatch!(level, simd => for_channels!(
-        channels, read_cotangents, simd, T, (input, v, tile, adjoint, &mut counts)
+        channels, read_cotangents, simd, T, (input, v, tile, adjoint)
     ));
     // What the layers of a block without a cotangent contribute is 0.
     let mut depths = composited.depths[tile];
     for (block, depth) in depths.iter_mut().enumerate() {
         if wanted >> block & 1 == 0 {
-            counts.skipped_blocks += u64::from(std::mem::take(depth));
+            *depth = 0;
         }
     }
-    counts.backward_blocks = depths.iter().copied().map(u64::from).sum();
     if wanted == 0 {
-        counts.skipped_tiles = 1;
-        return Ok((Vec::new(), counts));
+        return Ok(Vec::new());
     }
-    counts.backward_tiles = 1;
     if let Some(next) = input.tiles.lists.get(tile + 1) {
         next.prefetch();
         for (_, pixel, n) in input.runs(tile + 1) {
@@ -178,9 +169,7 @@ fn backward_tile<T: Real>(
         adjoint,
         layers,
     };
-    let out =
-        dispatch!(level, simd => for_channels!(channels, unblend_tile, simd, T, (&replayed)))?;
-    Ok((out, counts))
+    dispatch!(level, simd => for_channels!(channels, unblend_tile, simd, T, (&replayed)))
 }
 
 /// Fill `adjoint` with the cotangents of a tile. Returns the blocks with one that is not 0: bit b for block b.
@@ -191,7 +180,6 @@ fn read_cotangents<S: Simd, T: Real, const D: usize>(
     v: &CompositeCotangents<T>,
     tile: usize,
     adjoint: &mut Adjoint<T>,
-    counts: &mut Counts,
 ) -> u16 {
     let channels = if D > 0 { D } else { input.channels() };
     adjoint.clear();
@@ -214,7 +202,6 @@ fn read_cotangents<S: Simd, T: Real, const D: usize>(
                     *sum = -v_alpha.to_f64();
                     wanted |= u16::from(*v_alpha != T::ZERO) << (p / BLOCK_PIXELS);
                 }
-                counts.alpha_cotangents += n as u64;
             }
             for (v_color, b) in v_colors.iter().zip(input.background.unwrap_or(&[])) {
                 for (sum, v) in sums.iter_mut().zip(&v_color[p..p + BLOCK]) {

@@ -1,12 +1,12 @@
 //! Compositing, forward.
 
 use super::{
-    CompositeInput, Composited, TOGETHER, for_channels, for_count,
+    CompositeInput, Composited, TOGETHER, Work, for_channels, for_count,
     kernel::{self, Grid, Pixels},
+    plus,
 };
 use crate::{
     constants::{BLOCK, BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
-    counts::Counts,
     error::{Error, check_len},
     memory::{self, OfThreads},
     project::Projection,
@@ -30,8 +30,8 @@ pub struct Image<T> {
     pub tiles: Tiles<T>,
     /// For the backward pass.
     pub composited: Composited<T>,
-    /// Counts.
-    pub counts: Counts,
+    /// What it took.
+    pub work: Work,
     /// Wall-clock seconds that the tile lists took. Each is blended as soon as it is made: of the time that all threads
     /// spent on lists, one thread's part.
     pub bin_seconds: f64,
@@ -51,7 +51,13 @@ pub fn forward<T: Real>(
 ) -> Result<Image<T>, Error> {
     background.map_or(Ok(()), |b| check_len("background", b, channels))?;
     let started = Instant::now();
-    let (mut tiles, scattered) = tiles::scattered(projection, colors, channels, camera)?;
+    let (mut tiles, scattered) = tiles::scatter(
+        projection,
+        colors,
+        channels,
+        camera,
+        tiles::most_pairs::<T>(channels),
+    )?;
     let scattering = started.elapsed().as_secs_f64();
     let count = tiles.tiles_x * tiles.tiles_y;
     let mut lists = memory::with_capacity(count, "tile lists")?;
@@ -67,7 +73,7 @@ pub fn forward<T: Real>(
         camera,
         background,
     };
-    let (counts, listing) = lists
+    let (work, listing) = lists
         .par_iter_mut()
         .zip(&mut depths)
         .zip(transmittance.cut(repeat_n(TILE_PIXELS, count)))
@@ -80,12 +86,12 @@ pub fn forward<T: Real>(
             let listing = started.elapsed().as_secs_f64();
             let transmittance = transmittance.fill(T::ZERO);
             let colors = colors.fill([T::ZERO; TILE_PIXELS]);
-            let counts = dispatch!(level, simd => for_channels!(
+            let work = dispatch!(level, simd => for_channels!(
                 channels, forward_tile, simd, T, (&input, &grid, tile, list, depths, transmittance, colors)
             ));
-            Ok((counts, listing))
+            Ok((work, listing))
         })
-        .try_reduce(Default::default, |(a, b), (c, d)| Ok((a.plus(c), b + d)))?;
+        .try_reduce(Default::default, |(a, b), (c, d)| Ok((plus(a, c), b + d)))?;
     let (transmittance, painted) = (transmittance.finish(), painted.finish());
     let (image, alphas) = image_from_tiles(&input, &transmittance, &painted)?;
     tiles.lists = lists;
@@ -97,10 +103,7 @@ pub fn forward<T: Real>(
             depths,
             transmittance,
         },
-        counts: Counts {
-            channels: channels as u64,
-            ..counts
-        },
+        work,
         bin_seconds: scattering + listing / rayon::current_num_threads() as f64,
     })
 }
@@ -193,12 +196,8 @@ pub(super) fn forward_tile<S: Simd, T: Real, const D: usize>(
     depths: &mut [u32; TILE_BLOCKS],
     transmittance: &mut [T],
     colors: &mut [Pixels<T>],
-) -> Counts {
-    let mut counts = Counts {
-        tiles: u64::from(!list.records.is_empty()),
-        pairs: list.records.len() as u64,
-        ..Counts::default()
-    };
+) -> Work {
+    let mut work = [list.records.len() as u64, 0, 0, 0];
     for (p, _, n) in input.runs(tile) {
         transmittance[p..p + n].fill(T::ONE);
     }
@@ -207,9 +206,8 @@ pub(super) fn forward_tile<S: Simd, T: Real, const D: usize>(
         let layers = input.layers(list, block);
         let blended = for_count!(kernel::vectors::<S, T>(), V => kernel::blend::<S, T, D, V>(simd, grid, block, layers, pixels, colors));
         *depth = blended.layers as u32;
-        counts.blocks += blended.layers as u64;
-        counts.changed_blocks += blended.changed;
-        counts.blended += blended.pixels;
+        let more = [0, blended.layers as u64, blended.changed, blended.pixels];
+        work = plus(work, more);
     }
-    counts
+    work
 }

@@ -34,7 +34,13 @@ pub fn picture<T: Real>(
     background: Option<&[T]>,
 ) -> Result<Vec<u8>, Error> {
     background.map_or(Ok(()), |b| check_len("background", b, channels))?;
-    let (tiles, scattered) = tiles::scattered(projection, colors, channels, camera)?;
+    let (tiles, scattered) = tiles::scatter(
+        projection,
+        colors,
+        channels,
+        camera,
+        tiles::most_pairs::<T>(channels),
+    )?;
     let input = CompositeInput {
         projection,
         tiles: &tiles,

@@ -6,11 +6,10 @@ use super::{
     chunks,
     colors::ColorGroup,
     geometry::{Cotangent, Geometry, GeometryGrad},
-    lanes_in, sh,
+    lanes_in,
 };
 use crate::{
     constants::PROJECT_CHUNK,
-    counts::Counts,
     error::{Error, check_len},
     scene::{Camera, CameraGrad, Gaussians},
     simd::{
@@ -43,23 +42,34 @@ pub struct ProjectCotangents<'a, T> {
     pub colors: Option<&'a [T]>,
 }
 
+/// What errors call the cotangents, in their order, and how many numbers each Gaussian has of them.
+pub const COTANGENTS: [(&str, usize); 6] = [
+    ("v_means2d", 2),
+    ("v_whitened", 3),
+    ("v_opacities", 1),
+    ("v_depths", 1),
+    ("v_conics", 3),
+    ("v_colors", 3),
+];
+
 impl<'a, T: Copy> ProjectCotangents<'a, T> {
-    /// Their names, numbers per Gaussian and arrays.
-    fn arrays(&self) -> [(&'static str, usize, Option<&'a [T]>); 6] {
-        [
-            ("v_means2d", 2, self.means2d),
-            ("v_whitened", 3, self.whitened),
-            ("v_opacities", 1, self.opacities),
-            ("v_depths", 1, self.depths),
-            ("v_conics", 3, self.conics),
-            ("v_colors", 3, self.colors),
-        ]
+    /// The arrays, and what [`COTANGENTS`] says of them.
+    fn arrays(&self) -> impl Iterator<Item = (Option<&'a [T]>, (&'static str, usize))> {
+        let &Self {
+            means2d,
+            whitened,
+            opacities,
+            depths,
+            conics,
+            colors,
+        } = self;
+        let arrays = [means2d, whitened, opacities, depths, conics, colors];
+        arrays.into_iter().zip(COTANGENTS)
     }
 
     /// Check that they are those of `n` Gaussians.
     fn check(&self, n: usize) -> Result<(), Error> {
-        let mut arrays = self.arrays().into_iter();
-        arrays.try_for_each(|(name, row, array)| {
+        self.arrays().try_for_each(|(array, (name, row))| {
             array.map_or(Ok(()), |array| check_len(name, array, row * n))
         })
     }
@@ -71,7 +81,7 @@ impl<'a, T: Copy> ProjectCotangents<'a, T> {
         for (data, width) in [(g.means, 3), (g.quats, 4), (g.scales, 3), (g.opacities, 1)] {
             prefetch_rows(data, width, first, GROUP);
         }
-        for (_, row, array) in self.arrays() {
+        for (array, (_, row)) in self.arrays() {
             prefetch_rows(array.unwrap_or(&[]), row, first, GROUP);
         }
     }
@@ -200,35 +210,22 @@ pub struct Wanted {
     pub camera: bool,
 }
 
-/// Gradients of the projection's inputs; empty where not wanted. Zeros for a Gaussian that is culled or without
-/// a cotangent, and for harmonics above the degree in use.
+/// Gradients of the projection's inputs.
 #[derive(Debug)]
 pub struct GaussianGrads<T> {
-    /// [N, 3]
-    pub means: Vec<T>,
-    /// [N, 4]
-    pub quats: Vec<T>,
-    /// [N, 3]
-    pub scales: Vec<T>,
-    /// `[N]`
-    pub opacities: Vec<T>,
-    /// [N, 6]: entries xx, xy, xz, yy, yz, zz; those beside the diagonal stand for two.
-    pub covars: Vec<T>,
-    /// As `Harmonics::coefficients`.
-    pub harmonics: Vec<T>,
-    /// As `Harmonics::rest`.
-    pub harmonics_rest: Vec<T>,
+    /// Of the means [N, 3], quaternions [N, 4], scales [N, 3], opacities `[N]`, covariances [N, 6],
+    /// `Harmonics::coefficients` and `Harmonics::rest`; empty where not wanted. Zeros for a Gaussian that is culled or
+    /// without a cotangent, and for harmonics above the degree in use. Of a covariance the entries xx, xy, xz, yy, yz,
+    /// zz; those beside the diagonal stand for two.
+    pub arrays: [Vec<T>; 7],
     /// Of the camera.
     pub camera: CameraGrad,
-    /// Counts.
-    pub counts: Counts,
 }
 
-/// What one job fills of it: empty where not wanted.
+/// What one job fills of the arrays: empty where not wanted.
 struct BackwardChunk<'a, T> {
-    /// Of the means, quaternions, scales, opacities, covariances, harmonics and their rest.
     outs: [PieceWriter<'a, T>; 7],
-    /// Numbers per Gaussian, in that order.
+    /// Numbers per Gaussian, in their order.
     rows: [usize; 7],
 }
 
@@ -304,22 +301,13 @@ pub fn backward<T: Real>(
             ))
         })
         .collect();
-    let (mut camera_grad, mut counts) = (CameraGrad::ZERO, Counts::default());
-    for (part, more) in &parts {
+    let mut camera_grad = CameraGrad::ZERO;
+    for part in &parts {
         camera_grad.add(part);
-        counts = counts.plus(*more);
     }
-    let [means, quats, scales, opacities, covars, sh, rest] = arrays.map(UninitVec::finish);
     Ok(GaussianGrads {
-        means,
-        quats,
-        scales,
-        opacities,
-        covars,
-        harmonics: sh,
-        harmonics_rest: rest,
+        arrays: arrays.map(UninitVec::finish),
         camera: camera_grad,
-        counts,
     })
 }
 
@@ -336,7 +324,7 @@ fn backward_chunk<S: Simd, T: Real>(
     begin: usize,
     mut chunk: BackwardChunk<T>,
     camera_wanted: bool,
-) -> (CameraGrad, Counts) {
+) -> CameraGrad {
     let zero = splat_lanes(simd, 0.0);
     let camera_lanes = CameraLanes::new(
         simd,
@@ -355,7 +343,6 @@ fn backward_chunk<S: Simd, T: Real>(
         || v.depths.is_some()
         || v.conics.is_some();
     let shading = shading.filter(|_| v.colors.is_some());
-    let mut counts = Counts::default();
     let mut colors = ColorGroup::ZERO;
     let mut out = Columns::<T>::ZERO;
     let (mut buffers, zeros) = (chunk.buffers(), chunk.buffers());
@@ -383,12 +370,10 @@ fn backward_chunk<S: Simd, T: Real>(
         }
         inputs.read(simd, gaussians, first, options.activate);
         if let Some(shading) = shading {
-            counts.backward_harmonics += (rows * sh::count(shading.degree)) as u64;
             let (means, v_colors) = (&inputs.means, &cotangents.colors);
             let group = first / GROUP;
             colors.backward(simd, shading, group, means, center, v_colors, visible);
         }
-        counts.backward_gaussians += if geometry_wanted { rows as u64 } else { 0 };
         for at in (0..GROUP).step_by(lanes::<S>()) {
             // Not those that were culled, nor those beyond the end.
             let valid = lanes_in(simd, visible, at);
@@ -434,7 +419,7 @@ fn backward_chunk<S: Simd, T: Real>(
         chunk.put(&buffers, rows);
     }
     let camera_grads = &mut camera_grads[..sums::parts::<S, f64>()];
-    (CameraGradLanes::sum(camera_grads), counts)
+    CameraGradLanes::sum(camera_grads)
 }
 
 /// As gradients, in the type of the inputs.

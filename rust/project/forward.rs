@@ -5,12 +5,10 @@ use super::{
     camera_lanes::CameraLanes,
     chunks,
     colors::{Coefficients, Slopes},
-    sh,
     splats::SplatGroup,
 };
 use crate::{
     constants::PROJECT_CHUNK,
-    counts::Counts,
     error::Error,
     scene::{Camera, Colors, Gaussians},
     simd::{
@@ -42,8 +40,8 @@ pub struct Projected<T> {
     pub colors: Vec<T>,
     /// How they change, if asked for.
     pub shading: Option<Shading<T>>,
-    /// Counts.
-    pub counts: Counts,
+    /// How many were kept.
+    pub kept: usize,
 }
 
 /// What one job fills of it, group by group.
@@ -188,7 +186,7 @@ pub fn forward<T: Real>(
         .zip(slopes.cut(of_groups(sloped)))
         .zip(clamps.cut(of_groups(clamped_rows)))
         .collect();
-    let counts = jobs
+    let kept = jobs
         .into_par_iter()
         .enumerate()
         .with_max_len(1)
@@ -208,7 +206,7 @@ pub fn forward<T: Real>(
                 ))
             },
         )
-        .reduce(Counts::default, Counts::plus);
+        .sum();
     let [means2d, depths, conics, opacities, colors] = outs.map(UninitVec::finish);
     Ok(Projected {
         projection: Projection {
@@ -229,11 +227,11 @@ pub fn forward<T: Real>(
             slopes: slopes.finish(),
             clamped: clamps.finish(),
         }),
-        counts,
+        kept,
     })
 }
 
-/// Project the Gaussians from `begin` on, a chunk of the `n` that there are.
+/// Project the Gaussians from `begin` on, a chunk of the `n` that there are. Returns how many are kept.
 #[inline(always)]
 fn forward_chunk<S: Simd, T: Real>(
     simd: S,
@@ -244,12 +242,9 @@ fn forward_chunk<S: Simd, T: Real>(
     begin: usize,
     n: usize,
     mut out: ForwardChunk<T>,
-) -> Counts {
+) -> usize {
     let count = PROJECT_CHUNK.min(n - begin);
-    let mut counts = Counts {
-        gaussians: count as u64,
-        ..Counts::default()
-    };
+    let mut kept = 0;
     let camera_lanes = CameraLanes::new(
         simd,
         camera,
@@ -279,9 +274,7 @@ fn forward_chunk<S: Simd, T: Real>(
         shaded.clamped = [0; 3];
         match colors {
             Colors::Harmonics(ref h) if keep != 0 => {
-                counts.harmonics += (rows * sh::count(h.degree)) as u64;
                 let [_, _, clamped, sloped] = out.asked;
-                counts.slopes += if sloped { rows as u64 } else { 0 };
                 let slopes = sloped.then_some(&mut shaded.slopes);
                 let clamped = clamped.then_some(&mut shaded.clamped);
                 let direction = &group.direction;
@@ -299,7 +292,7 @@ fn forward_chunk<S: Simd, T: Real>(
                 }
             }
         }
-        counts.projected += u64::from(keep.count_ones());
+        kept += keep.count_ones() as usize;
         if keep != 0 {
             out.put(&group, keep, rows);
         } else {
@@ -307,7 +300,7 @@ fn forward_chunk<S: Simd, T: Real>(
         }
         out.put_colors(if shown { &shaded } else { &none }, rows);
     }
-    counts
+    kept
 }
 
 /// The values of the Gaussians in a set, 0 elsewhere.

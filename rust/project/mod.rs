@@ -8,7 +8,7 @@ mod geometry;
 pub mod sh;
 mod splats;
 
-pub use backward::{GaussianGrads, ProjectCotangents, Wanted, backward};
+pub use backward::{COTANGENTS, GaussianGrads, ProjectCotangents, Wanted, backward};
 pub use colors::Shading;
 pub use forward::{Projected, forward};
 

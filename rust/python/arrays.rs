@@ -10,11 +10,10 @@ use numpy::{
 use pyo3::{exceptions::PyValueError, prelude::*};
 use std::{
     any::Any,
-    collections::HashMap,
     fmt::Display,
     ops::Range,
     process,
-    sync::{Mutex, PoisonError},
+    sync::{Arc, Mutex, PoisonError, Weak},
 };
 
 /// A borrowed C-contiguous array of known type.
@@ -22,7 +21,7 @@ use std::{
 /// Python can still write to the memory while the GIL is released, as any thread can that has a view of it; nothing
 /// here can prevent that. What this file does prevent is that calls of the binding do.
 pub(crate) struct Borrowed<A> {
-    lease: Lease,
+    claim: Arc<Claim>,
     /// A copy: numpy's own lies in memory that another thread may free while the GIL is released, by setting
     /// the array's `shape`.
     shape: Vec<usize>,
@@ -36,7 +35,7 @@ pub(crate) type ArrayMut<'py, T> = Borrowed<PyReadwriteArrayDyn<'py, T>>;
 impl<'py, T: Element> Array<'py, T> {
     /// Borrow `value`, unless it cannot be read as it is or is being written.
     pub(crate) fn new(name: &'static str, value: &Bound<'py, PyAny>) -> BindingResult<Self> {
-        Self::leased(name, value, false, |array| {
+        Self::claimed(name, value, false, |array| {
             array.try_readonly().map_err(|e| refused(name, e))
         })
     }
@@ -51,7 +50,7 @@ impl<'py, T: Element> Array<'py, T> {
 impl<'py, T: Element> ArrayMut<'py, T> {
     /// Borrow `value`, unless it cannot be written as it is or is in use.
     pub(crate) fn new(name: &'static str, value: &Bound<'py, PyAny>) -> BindingResult<Self> {
-        Self::leased(name, value, true, |array| {
+        Self::claimed(name, value, true, |array| {
             array.try_readwrite().map_err(|e| refused(name, e))
         })
     }
@@ -63,7 +62,7 @@ impl<'py, T: Element> ArrayMut<'py, T> {
 }
 
 impl<A> Borrowed<A> {
-    fn leased<'py, T: Element>(
+    fn claimed<'py, T: Element>(
         name: &'static str,
         value: &Bound<'py, PyAny>,
         written: bool,
@@ -71,7 +70,7 @@ impl<A> Borrowed<A> {
     ) -> BindingResult<Self> {
         let array = as_it_is::<T>(name, value)?;
         Ok(Self {
-            lease: Lease::new(name, array, written)?,
+            claim: Claim::new(name, array, written)?,
             shape: array.shape().to_vec(),
             array: borrow(array)?,
         })
@@ -107,7 +106,7 @@ impl<A> Borrowed<A> {
     }
 
     fn wrong(&self, expected: &str) -> Error {
-        Error::shape(self.lease.name, expected, format!("{:?}", self.shape))
+        Error::shape(self.claim.name, expected, format!("{:?}", self.shape))
     }
 }
 
@@ -140,41 +139,34 @@ fn as_it_is<'a, 'py, T: Element>(
     Ok(array)
 }
 
-/// Memory that a call of the binding reads or writes at this moment.
-struct Claim {
-    name: &'static str,
-    addresses: Range<usize>,
-    written: bool,
-    number: u64,
-    /// The calls of the process that this one was forked from are not its own.
-    process: u32,
-}
-
-/// Those of all calls, in the order in which they were borrowed, and the number of the next one.
-static CLAIMS: Mutex<(Vec<Claim>, u64)> = Mutex::new((Vec::new(), 0));
-
-/// The entry of one array in [`CLAIMS`], as long as it is borrowed.
+/// Memory that a call of the binding reads or writes, as long as the array is borrowed.
 ///
 /// Memory that is written under one name and read or written under another is refused, in one call and in calls
 /// from several threads. rust-numpy knows views of one array, but two tensors over the same memory come as arrays
 /// that know nothing of each other.
-struct Lease {
+struct Claim {
     name: &'static str,
-    number: u64,
+    addresses: Range<usize>,
+    written: bool,
+    /// The calls of the process that this one was forked from are not its own.
+    process: u32,
 }
 
-impl Lease {
+/// Those of all calls, in the order in which they were made.
+static CLAIMS: Mutex<Vec<Weak<Claim>>> = Mutex::new(Vec::new());
+
+impl Claim {
     fn new<T: Element>(
         name: &'static str,
         array: &Bound<'_, PyArrayDyn<T>>,
         written: bool,
-    ) -> Result<Self, Error> {
+    ) -> Result<Arc<Self>, Error> {
         let begin = array.data().addr();
         let addresses = begin..begin + array.len() * size_of::<T>();
         let process = process::id();
-        let (claims, next) = &mut *CLAIMS.lock().unwrap_or_else(PoisonError::into_inner);
-        claims.retain(|place| place.process == process);
-        for other in claims.iter() {
+        let mut claims = CLAIMS.lock().unwrap_or_else(PoisonError::into_inner);
+        claims.retain(|claim| claim.upgrade().is_some_and(|c| c.process == process));
+        for other in claims.iter().filter_map(Weak::upgrade) {
             let both =
                 addresses.start.max(other.addresses.start) < addresses.end.min(other.addresses.end);
             if both && (written || other.written) {
@@ -187,23 +179,14 @@ impl Lease {
                 return Err(Error::new(of, message));
             }
         }
-        let number = *next;
-        *next += 1;
-        claims.push(Claim {
+        let claim = Arc::new(Self {
             name,
             addresses,
             written,
-            number,
             process,
         });
-        Ok(Self { name, number })
-    }
-}
-
-impl Drop for Lease {
-    fn drop(&mut self) {
-        let (claims, _) = &mut *CLAIMS.lock().unwrap_or_else(PoisonError::into_inner);
-        claims.retain(|place| place.number != self.number);
+        claims.push(Arc::downgrade(&claim));
+        Ok(claim)
     }
 }
 
@@ -277,9 +260,6 @@ pub(crate) fn of_type<'a, V: 'static>(stored: &'a AnyType, name: &str) -> Bindin
         .downcast_ref()
         .ok_or_else(|| Error::new(name, "dtype differs from the forward pass").into())
 }
-
-/// The counts of [`Counts`] by name.
-pub(crate) type CountsByName = HashMap<&'static str, u64>;
 
 /// A scalar type that the binding offers.
 pub(crate) trait Scalar: Real + Element {}

@@ -1,7 +1,7 @@
 //! The binding of the tile lists and of compositing.
 
 use crate::{
-    arrays::{AnyType, Array, CountsByName, Optional, by_dtype, join, of_type, optional_of_shape},
+    arrays::{AnyType, Array, Optional, by_dtype, join, of_type, optional_of_shape},
     error::BindingResult,
     project::{Frame, Projections, of_camera},
     threads,
@@ -9,7 +9,6 @@ use crate::{
 use hqgs::internals::{
     Error,
     composite::{self, CompositeCotangents, CompositeInput, Composited},
-    counts::Counts,
     tiles::Tiles,
 };
 use numpy::{IntoPyArray, PyArray1};
@@ -24,7 +23,14 @@ pub(crate) struct Composite {
     channels: usize,
     /// Of each camera; a `Vec<View<T>>`.
     views: AnyType,
-    counts: Counts,
+    /// Pairs of Gaussian and tile, blocks evaluated, blocks with a change: the work of the forward pass.
+    #[pyo3(get)]
+    work: (u64, u64, u64),
+    /// (Gaussian, pixel) pairs that were blended.
+    #[pyo3(get)]
+    blended: u64,
+    /// Wall-clock seconds that the tile lists took.
+    #[pyo3(get)]
     bin_seconds: f64,
 }
 
@@ -38,37 +44,6 @@ impl Drop for Composite {
 
 /// One camera's tile lists and replay state.
 type View<T> = (Tiles<T>, Composited<T>);
-
-#[pymethods]
-impl Composite {
-    /// (pairs, blocks evaluated, blocks with a change): the work of the forward pass.
-    #[getter]
-    fn work(&self) -> (u64, u64, u64) {
-        (
-            self.counts.pairs,
-            self.counts.blocks,
-            self.counts.changed_blocks,
-        )
-    }
-
-    /// Wall-clock seconds that the tile lists took.
-    #[getter]
-    fn bin_seconds(&self) -> f64 {
-        self.bin_seconds
-    }
-
-    /// (Gaussian, pixel) pairs that were blended.
-    #[getter]
-    fn blended(&self) -> u64 {
-        self.counts.blended
-    }
-
-    /// Counts of the forward pass.
-    #[getter]
-    fn counts(&self) -> CountsByName {
-        self.counts.entries().collect()
-    }
-}
 
 /// Bin and composite a frame.
 #[pyfunction]
@@ -92,9 +67,9 @@ pub(crate) fn composite_forward<'py>(
         let colors = colors.slice();
         let backgrounds = optional_of_shape::<T>("backgrounds", backgrounds, &[c, channels])?;
         let backgrounds = backgrounds.as_ref().map(Array::slice);
-        let (views, image, alphas, counts, bin_seconds) = threads::run(py, || {
+        let (views, image, alphas, work, bin_seconds) = threads::run(py, || {
             let (mut images, mut alphas, mut views) = (Vec::new(), Vec::new(), Vec::new());
-            let (mut total, mut bin_seconds) = (Counts::default(), 0.0);
+            let (mut work, mut bin_seconds) = ([0; 4], 0.0);
             for (i, camera) in frame.cameras.iter().enumerate() {
                 let view = composite::forward(
                     &frame.projections[i],
@@ -104,20 +79,22 @@ pub(crate) fn composite_forward<'py>(
                     backgrounds.map(|b| &b[i * channels..(i + 1) * channels]),
                 )?;
                 bin_seconds += view.bin_seconds;
-                total = total.plus(view.counts);
+                work = composite::plus(work, view.work);
                 images.push(view.image);
                 alphas.push(view.alphas);
                 views.push((view.tiles, view.composited));
             }
             let image = join(&mut images, |image| image)?;
             let alphas = join(&mut alphas, |alphas| alphas)?;
-            Ok((views, image, alphas, total, bin_seconds))
+            Ok((views, image, alphas, work, bin_seconds))
         })?;
+        let [pairs, blocks, changed, blended] = work;
         let state = Composite {
             frame: Arc::clone(frame),
             channels,
             views: Box::new(views),
-            counts,
+            work: (pairs, blocks, changed),
+            blended,
             bin_seconds,
         };
         let out = (state, image.into_pyarray(py), alphas.into_pyarray(py));
@@ -200,9 +177,6 @@ pub(crate) fn composite_backward<'py>(
             };
             frame.cameras.iter().enumerate().map(backward).collect()
         })?;
-        let counts = outs
-            .iter()
-            .fold(Counts::default(), |sum, out| sum.plus(out.counts));
         let means2d = join(&mut outs, |out| &mut out.means2d)?;
         let whitened = join(&mut outs, |out| &mut out.whitened)?;
         let opacities = join(&mut outs, |out| &mut out.opacities)?;
@@ -216,7 +190,6 @@ pub(crate) fn composite_backward<'py>(
             (geometry && absolute).then(|| absolutes.into_pyarray(py)),
             colors.then(|| v_colors.into_pyarray(py)),
             background.then(|| v_background.into_pyarray(py)),
-            counts.entries().collect::<CountsByName>(),
         );
         Ok(out.into_bound_py_any(py)?)
     })

@@ -2,7 +2,7 @@
 
 use hqgs::Error;
 use pyo3::{
-    CastError, PyErr,
+    PyErr,
     exceptions::{PyMemoryError, PyValueError},
 };
 
@@ -26,12 +26,6 @@ impl From<Error> for BindingError {
 impl From<PyErr> for BindingError {
     fn from(error: PyErr) -> Self {
         Self(error)
-    }
-}
-
-impl From<CastError<'_, '_>> for BindingError {
-    fn from(error: CastError<'_, '_>) -> Self {
-        Self(error.into())
     }
 }
 

@@ -52,18 +52,6 @@ fn give_back_memory(py: Python<'_>) -> BindingResult<()> {
     Ok(())
 }
 
-/// Use this many threads from now on, 1 to 1024; results do not depend on it.
-#[pyfunction]
-fn set_num_threads(py: Python<'_>, threads: i128) -> BindingResult<()> {
-    threads::set(py, threads)
-}
-
-/// Number of threads in use.
-#[pyfunction]
-fn get_num_threads(py: Python<'_>) -> BindingResult<usize> {
-    threads::get(py)
-}
-
 /// The vector instructions in use: the best of this CPU, or those that HQGS_SIMD names.
 #[pyfunction]
 fn simd_level() -> BindingResult<&'static str> {
@@ -76,7 +64,7 @@ mod _rust {
     use super::*;
 
     #[pymodule_export]
-    use super::{get_num_threads, give_back_memory, set_num_threads, simd_level};
+    use super::{give_back_memory, simd_level};
     #[pymodule_export]
     use crate::{
         composite::{Composite, composite_backward, composite_forward, composite_picture},
@@ -84,7 +72,8 @@ mod _rust {
         pictures::{Separable, cell_distance},
         project::{Frame, backward::project_backward, forward::project_forward},
         stereo::agreed_depths,
-        training::{adam_steps, add_harmonics, add_pulls, add_rows, all_below, photometric},
+        threads::{get_num_threads, set_num_threads},
+        training::{adam_steps, add_harmonics, add_pulls, add_rows, photometric},
     };
 
     #[pymodule_init]

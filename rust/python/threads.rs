@@ -1,5 +1,5 @@
 //! The thread pool: as many threads as `RAYON_NUM_THREADS` or the machine says, until
-//! [`set`] says otherwise. Results never depend on it.
+//! [`set_num_threads`] says otherwise. Results never depend on it.
 //!
 //! A process that forks leaves its child a pool without threads: work that it is given would wait for ever. The
 //! child therefore starts a pool of its own with as many threads, the first time that it needs one. All work goes
@@ -7,7 +7,7 @@
 
 use crate::error::BindingResult;
 use hqgs::Error;
-use pyo3::{Python, exceptions::PyRuntimeError};
+use pyo3::{Python, exceptions::PyRuntimeError, pyfunction};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::{
     mem, process,
@@ -44,14 +44,12 @@ fn pool(_: Python<'_>, threads: Option<usize>) -> BindingResult<Arc<ThreadPool>>
     Ok(pool)
 }
 
-/// The most threads that [`set`] takes: beyond it they only cost memory, and a mistyped number may stop the machine.
+/// The most threads that [`set_num_threads`] takes: beyond it they only cost memory, and a mistyped number may stop the machine.
 const MAX_THREADS: i128 = 1024;
 
-/// Use `threads` threads from now on.
-///
-/// # Errors
-/// When there are none or more than [`MAX_THREADS`], or the system refuses to start them.
-pub(crate) fn set(py: Python<'_>, threads: i128) -> BindingResult<()> {
+/// Use this many threads from now on, 1 to 1024; results do not depend on it.
+#[pyfunction]
+pub(crate) fn set_num_threads(py: Python<'_>, threads: i128) -> BindingResult<()> {
     if !(1..=MAX_THREADS).contains(&threads) {
         let message = format!("must be 1 to {MAX_THREADS}, got {threads}");
         return Err(Error::new("threads", message).into());
@@ -60,11 +58,9 @@ pub(crate) fn set(py: Python<'_>, threads: i128) -> BindingResult<()> {
     Ok(())
 }
 
-/// The number of threads in use.
-///
-/// # Errors
-/// When the system refuses to start them.
-pub(crate) fn get(py: Python<'_>) -> BindingResult<usize> {
+/// Number of threads in use.
+#[pyfunction]
+pub(crate) fn get_num_threads(py: Python<'_>) -> BindingResult<usize> {
     Ok(pool(py, None)?.current_num_threads())
 }
 

@@ -8,31 +8,13 @@ use crate::{
 use hqgs::{Error, Real};
 use hqgs_training::{
     adam::{self, AdamArrays, AdamOptions, AdamStep, Selection},
-    growth::{self, Pulls},
+    growth,
     loss::{self, Images, LossOptions, LossScratch},
     views::{self, ViewColors, ViewRows},
 };
 use numpy::{Element, IntoPyArray, PyArrayDyn};
 use pyo3::prelude::*;
 use std::cell::RefCell;
-
-/// A scalar type with buffers that last as long as the calling thread, so that a step allocates none.
-trait Buffered: Real + Element {
-    fn with_scratch<R>(f: impl FnOnce(&mut LossScratch<Self>) -> R) -> R;
-}
-
-macro_rules! buffered {
-    ($type:ty) => {
-        impl Buffered for $type {
-            fn with_scratch<R>(f: impl FnOnce(&mut LossScratch<Self>) -> R) -> R {
-                thread_local!(static SCRATCH: RefCell<LossScratch<$type>> = RefCell::default());
-                SCRATCH.with_borrow_mut(f)
-            }
-        }
-    };
-}
-buffered!(f32);
-buffered!(f64);
 
 /// Do the body with `$T` and `$Y` as the types of a render (f32 or f64) and of its target (u8 or the render's).
 macro_rules! by_dtypes {
@@ -82,7 +64,9 @@ pub(crate) fn photometric<'py>(
         };
         let mut grad = gradient::<T>(py, images.render.len(), want_grad)?;
         let out = want_grad.then_some(&mut grad[..]);
-        let value = T::with_scratch(|scratch| {
+        // Buffers that last as long as the calling thread, so that a step allocates none.
+        thread_local!(static SCRATCH: RefCell<LossScratch<T>> = RefCell::default());
+        let value = SCRATCH.with_borrow_mut(|scratch| {
             threads::run(py, || loss::photometric(images, &options, out, scratch))
         })?;
         let grad = want_grad.then(|| grad.into_pyarray(py).into_any());
@@ -201,7 +185,7 @@ pub(crate) fn add_rows(
     threads::run(py, || views::add(&views, sums, width, scale))
 }
 
-/// See [`Pulls::add`]: the `gradient [N, 2]` of one view is added to `sums [N]` and `views [N]`, all f32, where `radii
+/// See [`growth::add_pulls`]: the `gradient [N, 2]` of one view is added to `sums [N]` and `views [N]`, all f32, where `radii
 /// [N, 2] i32` are not 0.
 #[pyfunction]
 pub(crate) fn add_pulls(
@@ -216,39 +200,9 @@ pub(crate) fn add_pulls(
     let radii = Array::<i32>::new("radii", radii)?.of_shape(&[n, 2])?;
     let mut sums = ArrayMut::<f32>::new("sums", sums)?.of_shape(&[n])?;
     let mut views = ArrayMut::<f32>::new("views", views)?.of_shape(&[n])?;
-    let mut pulls = Pulls {
-        sums: sums.slice(),
-        views: views.slice(),
-    };
+    let (sums, views) = (sums.slice(), views.slice());
     let (gradient, radii) = (gradient.slice(), radii.slice());
-    threads::run(py, || pulls.add(gradient, radii, half))
-}
-
-/// See [`growth::all_below`]: of several arrays, f32 or f64, each with its limit.
-#[pyfunction]
-pub(crate) fn all_below(
-    py: Python<'_>,
-    arrays: Vec<(Bound<'_, PyAny>, f64)>,
-) -> BindingResult<bool> {
-    let (mut single, mut double) = (Vec::new(), Vec::new());
-    for (array, limit) in &arrays {
-        if is_f32("arrays", array)? {
-            single.push((Array::<f32>::new("arrays", array)?, *limit));
-        } else {
-            double.push((Array::<f64>::new("arrays", array)?, *limit));
-        }
-    }
-    let (single, double) = (slices(&single), slices(&double));
-    threads::run(py, || {
-        Ok(growth::all_below(&single) && growth::all_below(&double))
-    })
-}
-
-fn slices<'a, T: Element>(arrays: &'a [(Array<'_, T>, f64)]) -> Vec<(&'a [T], f64)> {
-    let arrays = arrays.iter();
-    arrays
-        .map(|(array, limit)| (array.slice(), *limit))
-        .collect()
+    threads::run(py, || growth::add_pulls(sums, views, gradient, radii, half))
 }
 
 /// `(rows [M] i32, colors [M, 3] f32, centre, degree)`

@@ -201,21 +201,29 @@ pub fn backward<T: Real>(
         &cotangents,
         project_wanted,
     )?;
-    let channels_wanted = wanted.colors && !harmonics;
+    let [
+        means,
+        quats,
+        scales,
+        opacities,
+        _,
+        of_harmonics,
+        colors_rest,
+    ] = grads.arrays;
     Ok(Gradients {
         viewmat: wanted
             .viewmat
             .then(|| grads.camera.viewmat(&rendered.camera)),
-        means: grads.means,
-        quats: grads.quats,
-        scales: grads.scales,
-        opacities: grads.opacities,
-        colors: if channels_wanted {
+        means,
+        quats,
+        scales,
+        opacities,
+        colors: if wanted.colors && !harmonics {
             splats.colors
         } else {
-            grads.harmonics
+            of_harmonics
         },
-        colors_rest: grads.harmonics_rest,
+        colors_rest,
         background: splats.background,
         means2d: if wanted.means2d {
             splats.means2d

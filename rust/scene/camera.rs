@@ -124,11 +124,6 @@ impl Camera {
         self.height
     }
 
-    /// The camera's centre in the world.
-    pub fn center(&self) -> [f64; 3] {
-        self.center.to_array()
-    }
-
     /// Row-major 4 x 4 world-to-camera matrix.
     pub fn viewmat(&self) -> [f64; 16] {
         let mut m = [0.0; 16];
@@ -205,7 +200,7 @@ mod tests {
         assert_eq!(camera.viewmat(), viewmat);
         assert_eq!(camera.k(), k);
         assert_eq!((camera.width(), camera.height()), (40, 30));
-        let c = camera.center();
+        let c = camera.center.to_array();
         for row in viewmat[..12].chunks_exact(4) {
             let seen: f64 = row[..3].iter().zip(&c).map(|(r, c)| r * c).sum();
             assert!((seen + row[3]).abs() < 1e-15);

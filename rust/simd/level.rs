@@ -7,13 +7,12 @@ use std::{cell::Cell, fmt, sync::OnceLock};
 const VARIABLE: &str = "HQGS_SIMD";
 
 /// Every level: how the variable names it, and its own name.
-const NAMES: [(&str, &str); 7] = [
+const NAMES: [(&str, &str); 6] = [
     ("avx512", "AVX-512"),
     ("avx2", "AVX2"),
     ("sse4.2", "SSE4.2"),
     ("sse2", "SSE2"),
     ("neon", "NEON"),
-    ("wasm", "WebAssembly SIMD"),
     ("scalar", "none"),
 ];
 
@@ -54,9 +53,7 @@ impl Level {
             fearless_simd::Level::Sse2(_) => 3,
             #[cfg(target_arch = "aarch64")]
             fearless_simd::Level::Neon(_) => 4,
-            #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
-            fearless_simd::Level::WasmSimd128(_) => 5,
-            _ => 6,
+            _ => 5,
         }]
     }
 }

@@ -186,17 +186,18 @@ impl Scene {
             wanted,
         )
         .expect("lengths");
+        let [means, quats, scales, opacities, _, of_harmonics, _] = &grads.arrays;
         let (g_colors, row) = if harmonics.is_some() {
-            (&grads.harmonics, 3 * STORED)
+            (of_harmonics, 3 * STORED)
         } else {
             (&composited.colors, 3)
         };
         let rows = (0..n).map(|i| Row {
             radii: [radii[2 * i], radii[2 * i + 1]],
-            means: grads.means[3 * i..3 * i + 3].to_vec(),
-            quats: grads.quats[4 * i..4 * i + 4].to_vec(),
-            scales: grads.scales[3 * i..3 * i + 3].to_vec(),
-            opacity: grads.opacities[i],
+            means: means[3 * i..3 * i + 3].to_vec(),
+            quats: quats[4 * i..4 * i + 4].to_vec(),
+            scales: scales[3 * i..3 * i + 3].to_vec(),
+            opacity: opacities[i],
             colors: g_colors[row * i..row * (i + 1)].to_vec(),
         });
         Output {

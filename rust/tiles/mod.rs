@@ -17,7 +17,7 @@ pub(crate) use spans::Reach;
 use crate::{
     constants::{MAX_PAIR_BYTES, MAX_PAIRS, TILE},
     error::Error,
-    memory::{self, OfThreads},
+    memory,
     project::Projection,
     scene::Camera,
     simd::Real,
@@ -41,55 +41,11 @@ pub struct Tiles<T> {
     pub(crate) chunks: Vec<Chunk>,
 }
 
-impl<T> Tiles<T> {
-    /// Number of (Gaussian, tile) pairs.
-    pub fn pairs(&self) -> usize {
-        self.lengths().sum()
-    }
-
-    /// Number of Gaussians that were binned, visible or not.
-    pub(crate) fn gaussians(&self) -> usize {
-        self.chunks.last().map_or(0, |chunk| chunk.end)
-    }
-
-    /// Number of pairs of each tile.
-    pub fn lengths(&self) -> impl Iterator<Item = usize> {
-        self.lists.iter().map(|list| list.records.len())
-    }
-}
-
 /// What an error calls the buffers of this folder.
 const NAME: &str = "tile lists";
 
 /// Gaussians per chunk where there are many.
 const CHUNK: usize = 8192;
-
-/// Bin the visible Gaussians into tiles, with the colours [N, channels] that they carry; there may be no
-/// channels where only weights are asked for.
-///
-/// # Errors
-/// When the (Gaussian, tile) pairs could take more than [`MAX_PAIR_BYTES`] or are more than [`MAX_PAIRS`], or there
-/// is no memory for them.
-pub fn bin<T: Real>(
-    projection: &Projection,
-    colors: &[T],
-    channels: usize,
-    camera: &Camera,
-) -> Result<Tiles<T>, Error> {
-    let (mut tiles, pairs) = scattered(projection, colors, channels, camera)?;
-    let count = tiles.tiles_x * tiles.tiles_y;
-    let mut lists = memory::with_capacity(count, NAME)?;
-    lists.resize_with(count, List::default);
-    let scratch = OfThreads::<Scratch<T>>::default();
-    lists
-        .par_iter_mut()
-        .enumerate()
-        .try_for_each(|(tile, list)| {
-            scratch.with(|scratch| pairs.list(projection, channels, tile, scratch, list))
-        })?;
-    tiles.lists = lists;
-    Ok(tiles)
-}
 
 /// The pairs of all chunks, not yet collected tile by tile.
 pub(crate) struct Scattered<T>(Vec<Pairs<T>>);
@@ -110,22 +66,17 @@ impl<T: Real> Scattered<T> {
     }
 }
 
-/// [`bin`] up to the lists, which are still to be made of the pairs.
-///
-/// # Errors
-/// As for [`bin`].
-pub(crate) fn scattered<T: Real>(
-    projection: &Projection,
-    colors: &[T],
-    channels: usize,
-    camera: &Camera,
-) -> Result<(Tiles<T>, Scattered<T>), Error> {
-    let limit = (MAX_PAIR_BYTES / pair_bytes::<T>(channels)).min(MAX_PAIRS);
-    scatter(projection, colors, channels, camera, limit)
+/// The most pairs of one view that carry so many channels.
+pub(crate) fn most_pairs<T>(channels: usize) -> u64 {
+    (MAX_PAIR_BYTES / pair_bytes::<T>(channels)).min(MAX_PAIRS)
 }
 
-/// The same with at most `limit` pairs.
-fn scatter<T: Real>(
+/// Find the tiles that the visible Gaussians reach, with the colours [N, channels] that they carry; there may be no
+/// channels where only weights are asked for. The lists are still to be made of the pairs.
+///
+/// # Errors
+/// When there are more than `limit` pairs, or no memory for them.
+pub(crate) fn scatter<T: Real>(
     projection: &Projection,
     colors: &[T],
     channels: usize,
@@ -158,12 +109,12 @@ fn scatter<T: Real>(
         .collect::<Result<_, Error>>()?;
     let (mut chunks, pairs): (Vec<_>, Vec<_>) = made.into_iter().unzip();
     if source.total.into_inner() > limit {
-        return Err(Error::TooManyPairs {
-            gaussians: n as u64,
-            tiles: (tiles_x * tiles_y) as u64,
-            limit,
-            bytes: limit * pair_bytes::<T>(channels),
-        });
+        let (tiles, bytes) = (tiles_x * tiles_y, limit * pair_bytes::<T>(channels));
+        let message = format!(
+            "{n} Gaussians reach more than {limit} times one of the {tiles} tiles of the image; so many pairs take up \
+             to {bytes} bytes; use fewer or smaller Gaussians, a smaller image or float32"
+        );
+        return Err(Error::new("means", message));
     }
     // Counts to places: in a tile chunk by chunk.
     let mut sums = memory::filled(0u32, tiles_x * tiles_y, NAME)?;
@@ -198,23 +149,28 @@ mod tests {
         let options = RenderOptions::default();
         let projected = project::forward(&s.gaussians(), none, &s.camera, &options, false).unwrap();
         let projection = projected.projection;
-        let pairs = bin::<f32>(&projection, &[], 0, &s.camera).unwrap().pairs() as u64;
+        let scatter = |limit| scatter::<f32>(&projection, &[], 0, &s.camera, limit);
+        let reached = |tiles: &Tiles<f32>| -> u64 {
+            let reached = tiles.chunks.iter().map(|chunk| chunk.reaches.len() as u64);
+            reached.sum()
+        };
+        let pairs = reached(&scatter(u64::MAX).unwrap().0);
         assert!(pairs > 20_000); // of several chunks
         for threads in [1, 3] {
             let pool = ThreadPoolBuilder::new().num_threads(threads);
             pool.build().unwrap().install(|| {
-                let scatter = |limit| scatter::<f32>(&projection, &[], 0, &s.camera, limit);
-                let (tiles, _) = scatter(pairs).unwrap();
-                let reached: usize = tiles.chunks.iter().map(|chunk| chunk.reaches.len()).sum();
-                assert_eq!(reached as u64, pairs);
+                assert_eq!(reached(&scatter(pairs).unwrap().0), pairs);
                 for limit in [pairs - 1, pairs / 2, 0] {
-                    let expected = Error::TooManyPairs {
-                        gaussians: 9000,
-                        tiles: 19 * 13,
-                        limit,
-                        bytes: limit * pair_bytes::<f32>(0),
-                    };
-                    assert_eq!(scatter(limit).map(|_| ()).unwrap_err(), expected);
+                    let message = scatter(limit).map(|_| ()).unwrap_err().to_string();
+                    let expected = format!(
+                        "means: 9000 Gaussians reach more than {limit} times one of the 247 tiles"
+                    );
+                    assert!(message.starts_with(&expected), "{message}");
+                    let bytes = limit * pair_bytes::<f32>(0);
+                    assert!(
+                        message.contains(&format!("up to {bytes} bytes")),
+                        "{message}"
+                    );
                 }
             });
         }

@@ -2,30 +2,20 @@
 
 use super::{Arrays, Frame};
 use crate::{
-    arrays::{Array, CountsByName, Scalar, by_dtype, join, of_type, optional_of_shape},
+    arrays::{Array, Scalar, by_dtype, join, of_type, optional_of_shape},
     error::BindingResult,
     threads,
 };
 use hqgs::internals::{
     Error,
-    project::{self, GaussianGrads, ProjectCotangents, Shading},
+    project::{self, COTANGENTS, GaussianGrads, ProjectCotangents, Shading},
     simd::Real,
 };
 use numpy::IntoPyArray;
 use pyo3::{IntoPyObjectExt, prelude::*};
 use std::{array, mem};
 
-/// What the cotangents are called, and how many numbers each Gaussian has of them.
-const COTANGENTS: [(&str, usize); 6] = [
-    ("v_means2d", 2),
-    ("v_whitened", 3),
-    ("v_opacities", 1),
-    ("v_depths", 1),
-    ("v_conics", 3),
-    ("v_colors", 3),
-];
-
-/// Their arrays for c cameras and n Gaussians.
+/// The arrays of [`COTANGENTS`] for c cameras and n Gaussians.
 fn cotangent_arrays<'py, T: Scalar>(
     given: &[Option<Bound<'py, PyAny>>],
     c: usize,
@@ -41,27 +31,13 @@ fn cotangent_arrays<'py, T: Scalar>(
         .collect()
 }
 
-/// The gradients by their place in `wanted`.
-fn arrays_of<T>(grads: &mut GaussianGrads<T>) -> [&mut Vec<T>; 7] {
-    [
-        &mut grads.means,
-        &mut grads.quats,
-        &mut grads.scales,
-        &mut grads.opacities,
-        &mut grads.covars,
-        &mut grads.harmonics,
-        &mut grads.harmonics_rest,
-    ]
-}
-
 /// Add the gradients from another camera; they stay finite.
-fn add<T: Real>(sums: &mut GaussianGrads<T>, mut grads: GaussianGrads<T>) {
-    for (sums, parts) in arrays_of(sums).into_iter().zip(arrays_of(&mut grads)) {
+fn add<T: Real>(sums: &mut [Vec<T>], grads: &[Vec<T>]) {
+    for (sums, parts) in sums.iter_mut().zip(grads) {
         for (s, p) in sums.iter_mut().zip(parts) {
             *s = T::saturating(s.to_f64() + p.to_f64());
         }
     }
-    sums.counts = sums.counts.plus(grads.counts);
 }
 
 /// VJP of `project_forward`. `inputs`: means, quats, scales, opacities; `cotangents` as in [`COTANGENTS`]; `wanted`:
@@ -110,10 +86,13 @@ pub(crate) fn project_backward<'py>(
             }
         };
         let (sums, viewmats, mut of_each) = threads::run(py, || {
-            let mut sums: Option<GaussianGrads<T>> = None;
+            let mut sums: Option<[Vec<T>; 7]> = None;
             let (mut viewmats, mut of_each) = (Vec::with_capacity(16 * c), Vec::new());
             for (i, camera) in frame.cameras.iter().enumerate() {
-                let mut grads = project::backward(
+                let GaussianGrads {
+                    mut arrays,
+                    camera: pose,
+                } = project::backward(
                     &gaussians,
                     shadings[i].as_ref(),
                     camera,
@@ -122,26 +101,24 @@ pub(crate) fn project_backward<'py>(
                     &cotangents_of(i),
                     asked,
                 )?;
-                viewmats.extend(grads.camera.viewmat(camera));
+                viewmats.extend(pose.viewmat(camera));
                 if frame.harmonics_of_each {
-                    of_each.push(mem::take(&mut grads.harmonics));
+                    of_each.push(mem::take(&mut arrays[5]));
                 }
                 match &mut sums {
-                    None => sums = Some(grads),
-                    Some(sums) => add(sums, grads),
+                    None => sums = Some(arrays),
+                    Some(sums) => add(sums, &arrays),
                 }
             }
             Ok((sums, viewmats, of_each))
         })?;
         let mut grads = sums.ok_or_else(|| Error::new("viewmats", "there is no camera"))?;
         if frame.harmonics_of_each {
-            grads.harmonics = join(&mut of_each, |harmonics| harmonics)?;
+            grads[5] = join(&mut of_each, |harmonics| harmonics)?;
         }
-        let counts: CountsByName = grads.counts.entries().collect();
-        let mut arrays = arrays_of(&mut grads);
         let [a, b, c, d, e, f, g] =
-            array::from_fn(|k| wanted[k].then(|| mem::take(arrays[k]).into_pyarray(py)));
+            array::from_fn(|k| wanted[k].then(|| mem::take(&mut grads[k]).into_pyarray(py)));
         let viewmats = wanted[7].then(|| viewmats.into_pyarray(py));
-        Ok((a, b, c, d, e, f, g, viewmats, counts).into_bound_py_any(py)?)
+        Ok((a, b, c, d, e, f, g, viewmats).into_bound_py_any(py)?)
     })
 }

@@ -9,7 +9,6 @@ use crate::{
 use hqgs::internals::{
     Error,
     accuracy_knobs::{AccuracyKnobs, Spans},
-    counts::Counts,
     project::{self, RenderOptions},
     scene::{Camera, Colors, Harmonics},
 };
@@ -168,13 +167,11 @@ pub(crate) fn project_forward<'py>(
         let radii = join(&mut outs, |out| &mut out.radii)?;
         let opacities = join(&mut outs, |out| &mut out.opacities)?;
         let colors = join(&mut outs, |out| &mut out.colors)?;
-        let counts = outs
-            .iter()
-            .fold(Counts::default(), |sum, out| sum.plus(out.counts));
+        let kept = outs.iter().map(|out| out.kept).sum();
         let shadings = outs.iter_mut().map(|out| out.shading.take());
         let frame = Frame(Arc::new(Projections {
             cameras,
-            counts,
+            kept,
             shadings: Box::new(shadings.collect::<Vec<_>>()),
             projections: outs.into_iter().map(|out| out.projection).collect(),
             options,

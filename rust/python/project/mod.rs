@@ -4,11 +4,10 @@ pub(crate) mod backward;
 pub(crate) mod forward;
 
 use crate::{
-    arrays::{AnyType, Array, CountsByName, Scalar},
+    arrays::{AnyType, Array, Scalar},
     error::BindingResult,
 };
 use hqgs::internals::{
-    counts::Counts,
     project::{Projection, RenderOptions},
     scene::{Camera, Gaussians},
 };
@@ -30,7 +29,7 @@ pub(crate) struct Projections {
     harmonics_of_each: bool,
     /// Of each camera; a `Vec<Option<Shading<T>>>`.
     shadings: AnyType,
-    counts: Counts,
+    kept: usize,
 }
 
 impl Projections {
@@ -55,10 +54,10 @@ impl Frame {
         self.0.size()[1]
     }
 
-    /// Counts of the projection.
+    /// How many pairs of Gaussian and camera were kept; the others are culled.
     #[getter]
-    fn counts(&self) -> CountsByName {
-        self.0.counts.entries().collect()
+    fn projected(&self) -> usize {
+        self.0.kept
     }
 }
 

@@ -103,28 +103,10 @@ pub struct AdamStep<'a, T> {
     pub selection: Selection,
 }
 
-/// Make step number `step` (from 1) of what is selected.
-///
-/// # Errors
-/// Names the array whose length does not match, or the setting out of its range.
-pub fn step<T: Real>(
-    arrays: AdamArrays<'_, T>,
-    step: u64,
-    options: &AdamOptions,
-    selection: &Selection,
-) -> Result<(), Error> {
-    steps(vec![AdamStep {
-        arrays,
-        step,
-        options: *options,
-        selection: *selection,
-    }])
-}
-
 /// The steps of several arrays, shared out among the threads together.
 ///
 /// # Errors
-/// As for [`step`]; then none has been made.
+/// Names the array whose length does not match, or the setting out of its range; then none has been made.
 pub fn steps<T: Real>(steps: Vec<AdamStep<'_, T>>) -> Result<(), Error> {
     let mut tasks: Vec<Task<'_, T>> = Vec::new();
     for step in steps {
@@ -143,7 +125,7 @@ pub fn steps<T: Real>(steps: Vec<AdamStep<'_, T>>) -> Result<(), Error> {
 /// Check several steps.
 ///
 /// # Errors
-/// As for [`step`].
+/// As for [`steps`].
 pub fn check<T: Real>(steps: &[AdamStep<'_, T>]) -> Result<(), Error> {
     steps.iter().try_for_each(|step| step.factors().map(|_| ()))
 }

@@ -2,6 +2,21 @@
 
 use super::*;
 use crate::{at_each_level, noise};
+
+fn step<T: Real>(
+    arrays: AdamArrays<'_, T>,
+    step: u64,
+    options: &AdamOptions,
+    selection: &Selection,
+) -> Result<(), Error> {
+    let (options, selection) = (*options, *selection);
+    steps(vec![AdamStep {
+        arrays,
+        step,
+        options,
+        selection,
+    }])
+}
 use hqgs::{Level, internals::simd::at_level};
 
 /// torch's formulas, one element at a time.

@@ -5,7 +5,7 @@ mod table;
 
 use criterion::{BenchmarkId, Criterion};
 use hqgs_training::{
-    adam::{self, AdamArrays, AdamOptions, Selection},
+    adam::{self, AdamArrays, AdamOptions, AdamStep, Selection},
     exposure::{Photograph, Sizes, Warp},
     jpeg_cells,
     loss::{self, Images, LossOptions, LossScratch},
@@ -207,7 +207,13 @@ fn optimizer(c: &mut Criterion) {
                     exp_avg: &mut exp_avg,
                     exp_avg_sq: &mut exp_avg_sq,
                 };
-                adam::step(arrays, step, &options, &Selection::ALL).expect("right lengths");
+                adam::steps(vec![AdamStep {
+                    arrays,
+                    step,
+                    options,
+                    selection: Selection::ALL,
+                }])
+                .expect("right lengths");
             });
         });
     }

@@ -10,7 +10,7 @@ use hqgs::{
     scene::{Camera, Colors, Gaussians},
 };
 use hqgs_training::{
-    adam::{self, AdamArrays, AdamOptions, Selection},
+    adam::{self, AdamArrays, AdamOptions, AdamStep, Selection},
     loss::{self, Images, LossOptions, LossScratch},
 };
 use std::{fs::File, io::BufWriter};
@@ -65,14 +65,18 @@ impl Parameters {
         }
     }
 
-    fn step(&mut self, grad: &[f32], step: u64) -> Result<(), Error> {
-        let arrays = AdamArrays {
-            param: &mut self.values,
-            grad,
-            exp_avg: &mut self.exp_avg,
-            exp_avg_sq: &mut self.exp_avg_sq,
-        };
-        adam::step(arrays, step, &AdamOptions::new(self.lr), &Selection::ALL)
+    fn step<'a>(&'a mut self, grad: &'a [f32], step: u64) -> AdamStep<'a, f32> {
+        AdamStep {
+            arrays: AdamArrays {
+                param: &mut self.values,
+                grad,
+                exp_avg: &mut self.exp_avg,
+                exp_avg_sq: &mut self.exp_avg_sq,
+            },
+            step,
+            options: AdamOptions::new(self.lr),
+            selection: Selection::ALL,
+        }
     }
 }
 
@@ -154,11 +158,13 @@ fn fit(target: &[f32], iterations: u64) -> Result<(Vec<f32>, Vec<f64>), Error> {
         for (g, opacity) in gradients.opacities.iter_mut().zip(&opacities) {
             *g *= opacity * (1.0 - opacity);
         }
-        means.step(&gradients.means, step)?;
-        quats.step(&gradients.quats, step)?;
-        log_scales.step(&gradients.scales, step)?;
-        logits.step(&gradients.opacities, step)?;
-        colors.step(&gradients.colors, step)?;
+        adam::steps(vec![
+            means.step(&gradients.means, step),
+            quats.step(&gradients.quats, step),
+            log_scales.step(&gradients.scales, step),
+            logits.step(&gradients.opacities, step),
+            colors.step(&gradients.colors, step),
+        ])?;
     }
     Ok((image, losses))
 }

@@ -31,27 +31,13 @@ pub struct Sizes {
 }
 
 impl Sizes {
-    /// That it has pixels, and no more than can be counted. Returns the size of the render.
-    fn check(&self) -> Result<[usize; 2], Error> {
-        let side = |side: usize| side.checked_add(self.margin.checked_mul(2)?);
-        let sides = (side(self.size[0]), side(self.size[1]));
-        if let (false, (Some(height), Some(width))) = (self.size.contains(&0), sides)
-            && height
-                .checked_mul(width)
-                .is_some_and(|n| n.checked_mul(3).is_some())
-        {
-            return Ok([height, width]);
-        }
-        let got = format!("{:?} with a margin of {}", self.size, self.margin);
-        Err(Error::shape("size", "a photo with pixels", got))
-    }
-
     fn render_size(&self) -> [usize; 2] {
-        self.size.map(|side| side + 2 * self.margin)
+        let margins = self.margin.saturating_mul(2); // no array has so many elements as these could
+        self.size.map(|side| side.saturating_add(margins))
     }
 
     fn pixels(&self) -> usize {
-        self.size[0] * self.size[1]
+        self.size[0].saturating_mul(self.size[1])
     }
 }
 
@@ -91,17 +77,6 @@ fn pieces<T: Copy>(vector: &mut UninitVec<T>, len: usize, size: usize) -> Vec<Un
     vector.cut((0..len).step_by(size).map(|at| size.min(len - at)))
 }
 
-/// A copy, made by all threads.
-fn copied<T: Light>(from: &[T], name: &str) -> Result<Vec<T>, Error> {
-    const PIECE: usize = 1 << 14;
-    let mut copy = UninitVec::new(from.len(), name)?;
-    pieces(&mut copy, from.len(), PIECE)
-        .into_par_iter()
-        .zip(from.par_chunks(PIECE))
-        .for_each(|(to, from)| to.writer().put(from));
-    Ok(copy.finish())
-}
-
 impl<T: Light> Photograph<T> {
     /// The photo [H, W, 3] of a render [H + 2 margin, W + 2 margin, 3], values of sRGB: the mean of the `warps` of
     /// its light, times `gains`. Without warps the render as it stands. `nearness` [H, W] is the inverse depth of
@@ -116,8 +91,13 @@ impl<T: Light> Photograph<T> {
         warps: &[Warp],
         gains: [f64; 3],
     ) -> Result<Self, Error> {
-        let [height, width] = sizes.check()?;
-        check_len("image", image, height * width * 3)?;
+        let [height, width] = sizes.render_size();
+        if sizes.size.contains(&0) {
+            let got = format!("{:?}", sizes.size);
+            return Err(Error::shape("size", "a photo with pixels", got));
+        }
+        let pixels = height.saturating_mul(width);
+        check_len("image", image, pixels.saturating_mul(3))?;
         if !nearness.is_empty() {
             check_len("nearness", nearness, sizes.pixels())?;
         }
@@ -131,11 +111,14 @@ impl<T: Light> Photograph<T> {
             }
         }
         let tables = tables();
-        let mut light = UninitVec::new(height * width, "light")?;
-        pieces(&mut light, height * width, BAND * width)
+        let mut light = UninitVec::new(pixels, "light")?;
+        let mut copy = UninitVec::new(image.len(), "image")?;
+        pieces(&mut light, pixels, BAND * width)
             .into_par_iter()
+            .zip(pieces(&mut copy, image.len(), BAND * width * 3))
             .zip(image.par_chunks(BAND * width * 3))
-            .for_each(|(light, image)| {
+            .for_each(|((light, copy), image)| {
+                copy.writer().put(image);
                 let light = light.fill([T::ZERO; WIDE]);
                 for (light, pixel) in light.iter_mut().zip(image.chunks_exact(3)) {
                     for c in 0..3 {
@@ -146,10 +129,10 @@ impl<T: Light> Photograph<T> {
         let mut taken = Self {
             sizes,
             photo: Vec::new(),
-            image: copied(image, "image")?,
+            image: copy.finish(),
             light: light.finish(),
             mean: Vec::new(),
-            nearness: copied(nearness, "nearness")?,
+            nearness: memory::copied(nearness, "nearness")?,
             warps: memory::copied(warps, "warps")?,
             gains,
         };

@@ -361,26 +361,16 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
         if let Some(grad) = grad {
             let scale = T::from_f64(self.plan.l1_scale);
             let narrow = T::from_f64(knee); // 0 where T has nothing so small
-            if narrow > T::ZERO {
-                for (grad, &q) in grad.iter_mut().zip(q) {
-                    *grad = if q > narrow {
-                        scale
-                    } else if q < -narrow {
-                        -scale
-                    } else {
-                        scale * (q / narrow)
-                    };
-                }
-            } else {
-                for (grad, &q) in grad.iter_mut().zip(q) {
-                    *grad = if q > T::ZERO {
-                        scale
-                    } else if q < T::ZERO {
-                        -scale
-                    } else {
-                        T::ZERO
-                    };
-                }
+            for (grad, &q) in grad.iter_mut().zip(q) {
+                *grad = if q > narrow {
+                    scale
+                } else if q < -narrow {
+                    -scale
+                } else if narrow > T::ZERO {
+                    scale * (q / narrow)
+                } else {
+                    T::ZERO
+                };
             }
             if let Some(i) = i {
                 let scale = T::from_f64(self.plan.ssim_scale);

@@ -60,14 +60,6 @@ impl<T: Real> Bands<T> {
         let weights = &self.weights[self.begins[row]..self.begins[row + 1]];
         (self.firsts[row], weights)
     }
-
-    fn map(&self, f: impl Fn(T) -> f64) -> Self {
-        let weights = self.weights.iter().map(|w| T::from_f64(f(*w)));
-        Self {
-            weights: weights.collect(),
-            ..self.clone()
-        }
-    }
 }
 
 /// A dense matrix, row-major.
@@ -134,7 +126,14 @@ impl<T: Real> Separable<T> {
     /// The absolute values of all weights.
     #[must_use]
     pub fn absolute(&self) -> Self {
-        let abs = |m: &Bands<T>| m.map(|w| w.to_f64().abs());
+        let abs = |m: &Bands<T>| Bands {
+            weights: m
+                .weights
+                .iter()
+                .map(|w| T::from_f64(w.to_f64().abs()))
+                .collect(),
+            ..m.clone()
+        };
         Self {
             rows: abs(&self.rows),
             columns: abs(&self.columns),
