@@ -17,7 +17,7 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.causes import Causes, causes, noise_of, pixel_maps, shares, shown_by
 from hqgs.evaluation.constants import CONFIDENCE
-from hqgs.evaluation.fit_cameras import Fitted, fit_cameras
+from hqgs.evaluation.fit_cameras import fit_cameras
 from hqgs.evaluation.held_out import HeldOutViews, held_out_renders, measured
 from hqgs.evaluation.intervals import difference, half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
@@ -67,45 +67,37 @@ def judge(
             f"{name}: none of its {len(gaussians):,} Gaussians is in front of any camera of {scene.name}: "
             "the photos' cameras are in another frame than the scene file"
         )
-    fits: list[Fitted] = []
-    if fit:
-        degree = gaussians.sh_degree
-        fits = fit_cameras(
-            views,
-            gaussians,
-            degree,
-            background,
-            lambda done: on_stage(Stage("held-out cameras fitted", done, len(views))),
-        )
+
+    def told(done: int) -> None:
+        on_stage(Stage("held-out cameras fitted", done, len(views)))
+
+    fits = fit_cameras(views, gaussians, gaussians.sh_degree, background, told) if fit else []
     fitted = held_out_renders(
         replace(scene, test=[one.view for one in fits]), gaussians, background=background, looks=looks
     )
-    sorted_errors, seconds = list[Causes | None](), list[float]()  # None: the mask leaves no pixel
+    sorted_errors, seconds = list[Causes | None](), list[float]()
     shown = shown_by(gaussians, [view.camera for view in scene.train])
     for k, view in enumerate(views):
         seconds.append(_seconds(gaussians, view, background))
         sorted_errors.append(_causes(renders, fitted, k, gaussians, view, shown))
         on_stage(Stage("errors sorted by their causes", k + 1, len(views)))
-    flats = [flat_psnr(view) for view in views]  # of one colour, the mean of the photo
-    names = renders.names
+    worse = [one.psnr is not None and flat_psnr(v) > one.psnr for v, one in zip(views, each, strict=True)]
     known: dict[str, Any] = {
         "name": name,
         "bytes": size,
         "gaussians": len(gaussians),
         "sh_degree": gaussians.sh_degree,
         "antialiased": gaussians.antialiased,
-        "worse_than_flat": sum(
-            one.psnr is not None and flat > one.psnr for flat, one in zip(flats, each, strict=True)
-        ),
+        "worse_than_flat": sum(worse),  # photos to which one colour, their mean, is nearer than the render
         "render_seconds": median(seconds),  # of a photo, on all threads
         "threads": get_num_threads(),
-        **numbers(names, each),
+        **numbers(renders.names, each),
     }
     if fits:
-        moved = [{"rotation_deg": fit.rotation_deg, "moved_px": fit.pixels} for fit in fits]
-        known["fitted"] = numbers(names, measured(fitted), moved)
+        moved = [{"rotation_deg": one.rotation_deg, "moved_px": one.pixels} for one in fits]
+        known["fitted"] = numbers(renders.names, measured(fitted), moved)
     known["causes"] = shares([one for one in sorted_errors if one is not None])
-    for of, one in zip(names, sorted_errors, strict=True):
+    for of, one in zip(renders.names, sorted_errors, strict=True):
         known["views"][of]["causes"] = one
     return known, renders
 
