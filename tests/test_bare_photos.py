@@ -386,23 +386,22 @@ def work_on(photos: list[np.ndarray], folder: Path) -> dict[str, np.ndarray]:
     return given
 
 
-def test_photos_rich_in_detail_are_looked_at_coarsely_and_others_finely(
-    photos: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    work = Work(tmp_path / "a", work_on(photos, tmp_path / "a"), 1)
-    assert not work.rich()
-    (fine,) = attempts(work)
-    monkeypatch.setattr(all_passes, "RICH", 20)
-    (rich,) = attempts(Work(tmp_path / "b", work_on(photos, tmp_path / "b"), 1))
-    assert [fine.one.name, rich.one.name] == ["fine", "coarse"]
-    counts = [sum(one.facts()["features"].values()) for one in (rich, fine)]
+def test_photos_are_looked_at_coarsely_where_that_is_enough(photos: list[np.ndarray], tmp_path: Path) -> None:
+    found = []
+    for folder, coarse in ((tmp_path / "a", True), (tmp_path / "b", False)):
+        given = work_on(photos, folder)
+        if not coarse:
+            del given["coarse"]
+        found += attempts(Work(folder, given, 1))
+    assert [one.one.name for one in found] == ["coarse", "fine"]
+    assert [one.registered for one in found] == [len(photos)] * 2
+    counts = [sum(one.facts()["features"].values()) for one in found]
     assert counts[0] < 0.6 * counts[1]
 
 
 def test_photos_that_coarse_features_do_not_place_are_looked_at_finely(
     photos: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(all_passes, "RICH", 0)
     monkeypatch.setattr(all_passes, "COARSE", 3)  # features, which place nothing
     work_on(photos, tmp_path)
     program.reconstruct(tmp_path, 2)
@@ -412,17 +411,36 @@ def test_photos_that_coarse_features_do_not_place_are_looked_at_finely(
     assert min(only["features"].values()) > 50
 
 
-def test_all_photos_are_smoothed_only_where_a_few_lost_ones_gain_by_it(
-    photos: list[np.ndarray], tmp_path: Path
+@pytest.mark.parametrize("coarse", [True, False])
+def test_all_photos_are_looked_at_again_only_where_a_few_lost_ones_gain_by_it(
+    photos: list[np.ndarray], tmp_path: Path, coarse: bool
 ) -> None:
     """A photo of something else has no place, however it is looked at."""
     foreign = np.random.default_rng(0).integers(0, 256, photos[0].shape).astype(np.uint8)
-    work = Work(tmp_path, work_on([*photos, foreign], tmp_path), 1)
-    (only,) = attempts(work)
+    given = work_on([*photos, foreign], tmp_path)
+    if not coarse:
+        del given["coarse"]
+    (only,) = attempts(Work(tmp_path, given, 1))
     assert only.registered == len(photos)
-    assert (tmp_path / "tried_1.0.db").is_file()
-    assert len(list((tmp_path / "photos_1.0").iterdir())) <= 3  # it, and the two that it matches best
-    assert not (tmp_path / "smoothed_1.0.db").exists()
+    tried = tmp_path / ("fine.db" if coarse else "smoothed_1.0.db")
+    with pycolmap.Database.open(tried) as db:
+        seen = [db.num_keypoints_for_image(k + 1) > 0 for k in range(len(photos) + 1)]
+    assert 0 < sum(seen) <= 3  # it, and the two that it matches best
+
+
+def test_where_photos_placed_one_after_the_other_find_no_place_all_are_placed_at_once(
+    photos: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And where the matches do not bear that out, they are not."""
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *args, **kwargs: {})
+    given = work_on(photos, tmp_path)
+    found = Attempt(Work(tmp_path, given, 1), PASSES[0])
+    found.run()
+    assert found.registered == len(photos)
+    monkeypatch.setattr(all_passes, "borne_out", lambda *args: 0.7)
+    found = Attempt(Work(tmp_path, given, 1), PASSES[0])
+    found.run()
+    assert found.model is None
 
 
 def test_of_many_photos_those_that_are_alike_are_matched(tmp_path: Path) -> None:
@@ -462,7 +480,7 @@ def test_of_many_photos_those_that_are_alike_are_matched(tmp_path: Path) -> None
 def test_the_second_pass_takes_more() -> None:
     """A few photos of the first pass lead to a second one, whose thresholds are all lower."""
     work = Work.__new__(Work)
-    work.fixed, work.now = False, FINE
+    work.fixed, work.quick, work.now = False, False, FINE
     strict = work.mapping()
     work.now = PASSES[-1]
     mild = work.mapping()

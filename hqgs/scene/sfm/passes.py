@@ -27,7 +27,6 @@ from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.sfm.database import (
     LARGEST,
     LEAST_PHOTOS,
-    PROBED,
     extract,
     join,
     known_cameras,
@@ -42,8 +41,9 @@ from hqgs.scene.sfm.refine import placed_names, refined
 from hqgs.scene.sfm.refine.agree import Agreement, loose_parts
 
 ALMOST = 0.95  # of the photos: with fewer, they are looked at again, more closely
-RICH = 1000  # features (median of the probed photos) from where on coarse ones are enough
-COARSE = 2048  # features of a photo looked at coarsely (before those with two directions count twice)
+COARSE, FINE = 2048, 4096  # features of a photo (before those with two directions count twice), where they
+# are found in little time
+BORNE_OUT = 0.78  # of the matches, by places found at once: 0.81 to 1 where right, 0.72 and 0.74 where wrong
 TRIED, GAIN = 6, 1.2  # photos by which a closer look is tried first; times the matches that it must bring
 TRIALS = 1000  # of RANSAC for each pair's geometry; COLMAP's 30,000 took 20 minutes of a corridor and told
 # the same pairs but for one in 23 that had 18 matches
@@ -59,7 +59,10 @@ class Pass:
 
     name: str
     enough: float = ALMOST
-    coarse: bool = False  # photos rich in detail, as large as they are and no larger
+    coarse: bool = (
+        False  # photos as large as they are; else SIFT looks at them at twice their size, which takes
+    )
+    # three quarters of its time
     sigmas: tuple[float, ...] = (0.0,)  # px of what SIFT sees: smoothed versions whose features join
     tolerant: bool = False  # weaker features, and fewer matches are enough
 
@@ -84,6 +87,7 @@ class Work:
         self.photos: Path = Path(str(given["photos"]))
         self.faces: int = len(given.get("rotations", [0]))  # of a photo
         self.fixed: bool = "Ks" in given or self.faces > 1
+        self.quick: bool = "coarse" in given  # whether photos may be looked at coarsely
         self.now: Pass = PASSES[1]
         self.most: int = 0  # photos with a place in a model of this pass
 
@@ -97,34 +101,31 @@ class Work:
             new.rename(path)
         return path
 
-    def rich(self) -> bool:
-        """Whether a few photos show enough where they are not enlarged.
-
-        SIFT looks at each photo at twice its size else, which takes three quarters of its time.
-        """
-        if "coarse" not in self.given:
-            return False
-        database, some = self.database("coarse"), self.names[:: -(-len(self.names) // PROBED)]
-        with self.watched("features", len(some)):
-            extract(self.directory, self.photos, some, self._extraction(PASSES[0]), database)
-        with pycolmap.Database.open(database) as db:
-            found = [db.num_keypoints_for_image(self.names.index(name) + 1) for name in some]
-        return float(np.median(found)) >= RICH
-
     def gains(self, one: Pass, before: Attempt) -> bool:
-        """Whether photos that an attempt placed nowhere match better when they are smoothed: a few are tried,
-        each with the two that it matches best."""
-        count, sigma = len(self.names), one.sigmas[-1]
-        placed = set() if before.model is None else placed_names(before.model)
-        lost = [k for k, name in enumerate(self.names) if name not in placed]
+        """Whether photos that an attempt placed nowhere match those with a place better in another pass.
+
+        A few are tried, those that match best as it is, each with two; where none has a place, a few of all.
+        """
+        self.now, count = one, len(self.names)
+        placed = np.zeros(count, bool)
+        if before.model is not None:
+            has = placed_names(before.model)
+            placed = np.array([name in has for name in self.names])
         next_ones = np.eye(count, k=1, dtype=np.int64) + np.eye(count, k=-1, dtype=np.int64)
         matches = table(before.database, count, "read_num_matches") + next_ones
-        partners = {k: np.argsort(-matches[k], kind="stable")[:2].tolist() for k in lost}
-        some_lost = [lost[i] for i in evenly(len(lost), TRIED)]
-        pairs = {(min(k, j), max(k, j)) for k in some_lost for j in partners[k]}
+        if placed.any():
+            matches[:, ~placed] = matches[placed] = 0
+            lost = np.argsort(-matches.max(axis=1), kind="stable")[:TRIED].tolist()
+        else:
+            lost = evenly(count, TRIED)
+        partners = np.argsort(-matches, axis=1, kind="stable")[:, :2]
+        pairs = {(min(k, j), max(k, j)) for k in lost for j in partners[k].tolist() if matches[k, j]}
+        if not pairs:
+            return False
         tried = np.array(sorted(pairs))
+        sigma = one.sigmas[-1]
         some = [self.names[k] for k in np.unique(tried)]
-        database, photos = self.database(f"tried_{sigma}"), self.smoothed(sigma, some)
+        photos, database = self._seen(one, sigma, some)
         self.match(photos, some, one, database, lambda: tried)
         self.verify(database)
         rows, columns = tried.T
@@ -148,11 +149,15 @@ class Work:
         return joined
 
     def _version(self, one: Pass, sigma: float) -> Path:
-        plain = one.name if one.sigmas == Pass.sigmas else "fine"
-        database = self.database(f"smoothed_{sigma}" if sigma else plain)
-        photos = self.smoothed(sigma, self.names) if sigma else self.photos
+        photos, database = self._seen(one, sigma, self.names)
         self.match(photos, self.names, one, database, lambda: self._pairs(one, database))
         return database
+
+    def _seen(self, one: Pass, sigma: float, names: Sequence[str]) -> tuple[Path, Path]:
+        """The folder with photos of these names as a pass sees them, and the database of what it finds."""
+        if sigma:
+            return self.smoothed(sigma, names), self.database(f"smoothed_{sigma}")
+        return self.photos, self.database(one.name if one.sigmas == Pass.sigmas else "fine")
 
     def match(
         self, photos: Path, some: list[str], one: Pass, database: Path, wanted: Callable[[], Any]
@@ -167,8 +172,10 @@ class Work:
     def _extraction(self, one: Pass) -> pycolmap.FeatureExtractionOptions:
         extraction = pycolmap.FeatureExtractionOptions()
         extraction.num_threads, extraction.max_image_size = self.threads, LARGEST
+        if self.quick:
+            extraction.sift.max_num_features = COARSE if one.coarse else FINE
         if one.coarse:
-            extraction.sift.first_octave, extraction.sift.max_num_features = 0, COARSE
+            extraction.sift.first_octave = 0
         if one.tolerant:
             extraction.sift.peak_threshold /= 4
         return extraction
@@ -210,7 +217,7 @@ class Work:
         options = pipeline_options()
         options.min_model_size = LEAST_PHOTOS
         mapper = options.mapper
-        if self.now.coarse:
+        if self.quick:
             options.ba_global_frames_ratio = options.ba_global_points_ratio = SELDOM
             options.ba_global_max_refinements = 2
         if self.now.tolerant:
@@ -324,7 +331,27 @@ class Attempt:
             order = sorted(models, key=lambda k: (-models[k].num_reg_images(), -models[k].num_points3D(), k))
             self.model = models[order[0]]
             self.apart = apart([placed_names(models[k]) for k in order], LEAST_PHOTOS)
+        if work.quick and work.faces == 1 and self.registered < ALMOST * len(work.names):
+            self._at_once()
+        if self.model is not None:
             work.settle(self.model)
+
+    def _at_once(self) -> None:
+        """Place all photos at once, where one after the other found few (a street walked along: no pair shows
+        depth enough to begin with), and the matches bear the places out."""
+        work = self.work
+        folder = work.directory / f"global_{self.one.name}"
+        folder.mkdir(exist_ok=True)
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads, options.random_seed = 1, 0
+        copy = shutil.copyfile(self.database, folder / "colmap.db")  # it writes relative poses
+        models = pycolmap.global_mapping(copy, work.photos, folder, options=options)
+        best = max(models.values(), key=lambda one: one.num_reg_images(), default=None)
+        if best is None:
+            return
+        share = borne_out(self.database, best)
+        if best.num_reg_images() > self.registered and share >= BORNE_OUT:
+            self.model, self.apart = best, []
 
     def bring_home(self) -> None:
         """Place the photos that have no place where weaker evidence tells one.
@@ -384,17 +411,17 @@ def attempts(work: Work) -> list[Attempt]:
     for one in plain:
         if best is not None and best.registered >= one.enough * len(work.names):
             break
-        if one.coarse and not work.rich():
+        if one.coarse and not work.quick:
             continue
-        if one.sigmas != Pass.sigmas and best is not None and not work.gains(one, best):
+        if best is not None and not work.gains(one, best):
             break
         now = Attempt(work, one)
         now.run()
         pair = [now] if best is None else [now, best] if best.one.coarse else [best, now]
         best = max(pair, key=lambda attempt: attempt.registered)
-    assert best is not None  # the fine pass has no condition
+    assert best is not None  # the first pass has no condition
     best.bring_home()
-    if best.registered >= tolerant.enough * len(work.names):
+    if best.registered >= tolerant.enough * len(work.names) or not work.gains(tolerant, best):
         return [best]
     second = Attempt(work, tolerant)
     second.run()

@@ -41,7 +41,7 @@ LONG, MANY = 60.0, 150  # s, photos: from where on the user is told before it be
 AGAIN = 4  # times the first pass, that all passes take at most
 
 PROGRAM = Path(__file__).with_name("program.py")
-FORMAT = 2  # of what is kept: raised by hand where other poses or points would be found, or stored otherwise
+FORMAT = 3  # of what is kept: raised by hand where other poses or points would be found, or stored otherwise
 STAGES = {
     "features": "COLMAP: features",
     "matches": "COLMAP: pairs of photos matched",
@@ -170,8 +170,7 @@ def run_colmap(
         keep: a folder for models: COLMAP does not run again for the same photos, masks and cameras,
             and goes on with the features and matches of a call that was interrupted.
         on_stage: hears what is being done.
-        coarse: photos rich in detail may be looked at coarsely, which is faster, as long as 95 % of them are
-            placed.
+        coarse: photos may be looked at coarsely, which is faster, as long as 95 % of them are placed.
         called: what the user calls the photos of those names.
 
     Raises ValueError for fewer than 3 photos, where COLMAP fails, or where the photos do not match.
