@@ -5,6 +5,7 @@ It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's pro
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,9 @@ FILM_NEAR, FILM_THIN = 10, 24  # frames of a film that are matched with the next
 DESCRIPTOR = 512  # length of COLMAP's descriptors, whole numbers
 
 
-def likely_pairs(db: pycolmap.Database, count: int, most: int = PARTNERS) -> NDArray[np.int64]:
+def likely_pairs(
+    db: pycolmap.Database, count: int, most: int = PARTNERS, threads: int = 1
+) -> NDArray[np.int64]:
     """Pairs [P, 2] of `count` photos, which have the numbers 1 to `count` in `db`, sorted, from 0.
 
     The largest features of each photo are compared with those of each other. A photo is paired with the
@@ -32,13 +35,18 @@ def likely_pairs(db: pycolmap.Database, count: int, most: int = PARTNERS) -> NDA
     descriptors = [_largest(db, k + 1) for k in range(count)]
     scores = np.zeros((count, count), np.int64)
     step = max(1, AT_ONCE // max(1, *(one.size for one in descriptors)))  # photos at a time
-    for start in range(0, count, step):
-        block = descriptors[start : start + step]
-        together = np.concatenate(block).T
-        ends = np.cumsum([len(one) for one in block])
-        for k, one in enumerate(descriptors):
-            for other, alike in enumerate(np.split(one @ together, ends[:-1], axis=1), start):
-                scores[k, other] = 0 if k == other else fitting(alike, DESCRIPTOR)
+    with ThreadPoolExecutor(threads) as pool:
+        for start in range(0, count, step):
+            block = descriptors[start : start + step]
+            together = np.concatenate(block).T
+            ends = np.cumsum([len(one) for one in block])
+
+            def compare(k: int, start: int = start, together: Any = together, ends: Any = ends) -> None:
+                products = np.split(descriptors[k] @ together, ends[:-1], axis=1)
+                for other, alike in enumerate(products, start):
+                    scores[k, other] = 0 if k == other else fitting(alike, DESCRIPTOR)
+
+            list(pool.map(compare, range(count)))
     return partners(scores + scores.T, most)
 
 

@@ -188,7 +188,8 @@ class Work:
         if len(self.names) > MATCHED_ALL:
             self.tell("matches", 0)
             with pycolmap.Database.open(database) as db:
-                pairs = likely_pairs(db, len(self.names), PARTNERS * (2 if one.tolerant else 1))
+                most = PARTNERS * (2 if one.tolerant else 1)
+                pairs = likely_pairs(db, len(self.names), most, self.threads)
         return pairs if self.faces == 1 else pairs_of_faces(len(self.names), self.faces, pairs)
 
     def smoothed(self, sigma: float, names: Sequence[str]) -> Path:
