@@ -162,7 +162,7 @@ class _Project(torch.autograd.Function):
             v_colors = None
         cotangents = v_means2d, v_link, v_alphas, v_depths, v_conics, v_colors
         inputs = as_array(means), as_array(quats), as_array(scales), as_array(opacities)
-        v_inputs = [*_rust.project_backward(ctx.frame, inputs, tuple(map(_optional, cotangents)), needs)[:8]]
+        v_inputs = [*_rust.project_backward(ctx.frame, inputs, tuple(map(_optional, cotangents)), needs)]
         if v_inputs[7] is not None:  # computed in f64; stay finite in the dtype of the inputs
             limit = torch.finfo(means.dtype).max
             v_inputs[7].clip(-limit, limit, out=v_inputs[7])
@@ -223,7 +223,7 @@ class _Composite(torch.autograd.Function):
         need_colors, need_depths = need_colors and "RGB" in ctx.mode, need_depths and ctx.mode != "RGB"
         need_backgrounds = need_backgrounds and ctx.behind is not None
         wanted = [geometry, ctx.absgrad, need_colors or need_depths, need_backgrounds]
-        v_inputs = _rust.composite_backward(ctx.state, ctx.behind, v_image, v_alphas, wanted)[:6]
+        v_inputs = _rust.composite_backward(ctx.state, ctx.behind, v_image, v_alphas, wanted)
         v_means2d, v_link, v_alphas_in, v_abs, v_colors, v_backgrounds = v_inputs
         v_means2d, v_packed = _tensor(v_means2d, c, n, 2), None
         v_abs = _tensor(v_abs, c, n, 2)
