@@ -143,8 +143,8 @@ def test_others_are_held_back_where_the_first_photos_do_not_tell() -> None:
 class FakeLooks(FakeRun):
     """A trainer whose renders are off the photos by what its formation leaves."""
 
-    off: ClassVar = {"vignetting": 0.1, "vignetting+exposure": 0.05}
-    blurred: ClassVar = {"vignetting+exposure": 0.04, "vignetting+exposure+shake": 0.05}
+    off: ClassVar = {"none": 0.1, "exposure": 0.05, "exposure+vignetting": 0.06, "exposure+response": 0.04}
+    blurred: ClassVar = {"exposure+response": 0.04, "exposure+response+shake": 0.03}
 
     def begin(self, plan: RunPlan) -> None:
         super().begin(plan)
@@ -156,8 +156,9 @@ class FakeLooks(FakeRun):
         assert view.mask is not None
         hidden = ~view.mask[..., None]
         assert hidden.mean() == 0.5
-        off = self.off if len(self.scene.train) > 16 else self.blurred
-        error = off[self.tried[-1]] * np.random.default_rng(number).choice([-1, 1], view.image.shape)
+        error = (self.off | self.blurred)[self.tried[-1]] * np.random.default_rng(number).choice(
+            [-1, 1], view.image.shape
+        )
         return np.where(hidden, view.image / 255 + error, 9.0).astype(np.float32)
 
 
@@ -173,13 +174,15 @@ def test_a_look_is_kept_where_photos_held_back_gain_by_it() -> None:
         runs.append(FakeLooks(part, config))
         return runs[-1]
 
-    formation = "exposure+vignetting+shake+focus+noise:12"
+    formation = "exposure+vignetting+response+shake+focus+noise:12"
     asked = replace(ASKED, hqgs=replace(ASKED.hqgs, formation=formation))
     found = trial.tried_looks(replace(scene, train=train), asked, begin, stages.append)  # type: ignore[arg-type]
     assert [run.tried for run in runs] == [[*FakeLooks.off], [*FakeLooks.blurred]]
-    assert {name: tried.helps for name, tried in found.items()} == {"exposure": True, "shake": False}
+    assert {name: tried.helps for name, tried in found.items()} == {
+        "exposure": True, "vignetting": False, "response": True, "shake": True,
+    }  # fmt: skip
     assert found["exposure"].gain == pytest.approx(20 * np.log10(2), abs=0.6)
-    assert {(now.done, now.total) for now in stages} >= {(400, 400), (640, 640)}
+    assert {(now.done, now.total) for now in stages} >= {(800, 800), (640, 640)}
     assert trial.tried_looks(scene, ASKED, begin) == {}  # type: ignore[arg-type]
 
 

@@ -6,11 +6,10 @@ are never looked at. Two kinds of parts are tried:
 - Growth. Where a photo is not yet shown as it is, growth adds Gaussians, whether or not other photos bear
   them out. Poses that are a little off, light that changes, mirrors and what a codec left ask for them
   without end: then they explain each photo alone, and views between photos are worse with every step.
-- What photos have of their own, where the diagnosis finds it: gains and shake. Light that moves, a flash and
-  reflections look like gains, and a scene shown without them is then wrong all over. Of a photo held back
-  one half is shown, which tells what its camera did; it is measured on the other, as that camera takes the
-  scene, brightness and tint set aside. Vignetting and responses gain less than two short runs of the same
-  scene differ: the diagnosis tells them, with their standard errors.
+- What photos and cameras have of their own, where the diagnosis finds it: gains, vignetting, responses,
+  shake. Light that moves, a flash and reflections look like the first, and a scene shown without them
+  is then wrong all over. Of a photo held back one half is shown, which tells what its camera did; it is
+  measured on the other, as that camera takes the scene, brightness and tint set aside.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from hqgs.base.evenly import evenly
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.evaluation.held_out import HeldOutViews
 from hqgs.evaluation.metrics import haarpsi, psnr_aligned, ssim
-from hqgs.photos.formula import DEVICES, NONE, parse_formation
+from hqgs.photos.formula import NONE, parse_formation
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import TrainConfig, with_iterations
@@ -35,9 +34,9 @@ from hqgs.training.rules import MANY_PHOTOS, no_growth
 
 
 class Looks(NamedTuple):
-    """A part of the formation, and how it is tried."""
+    """Parts of the formation, in the order in which they are tried, and how."""
 
-    kind: str
+    kinds: tuple[str, ...]
     photos: int  # at most
     side: int  # px of the copies
     steps: int  # of each short run
@@ -47,7 +46,7 @@ class Looks(NamedTuple):
 # A photo's own shake is learned after 20 looks at it, and seen where it has a pixel: in copies of 120 px that
 # of the built-in room gains nothing, in 240 px 0.8 dB. Photos gain so differently that it takes many to tell.
 # Focus takes more looks than a short run has: there the diagnosis decides.
-LOOKS = (Looks("exposure", 1000, 120, 200, 4), Looks("shake", 16, 240, 320, 2))
+LOOKS = (Looks(("exposure", "vignetting", "response"), 1000, 120, 200, 4), Looks(("shake",), 16, 240, 320, 2))
 EACH, OFFSETS = 4, (1, 3)  # every so-manieth photo is held back, from these on, one after the other
 STEPS, SIDES = 400, (80, 320)  # of each short run; px of the copies, at least and at most
 SHARE = 0.05  # of the pixels that the run trains on: those of the trial of growth
@@ -116,20 +115,24 @@ def tried_looks(
     scene: Scene, settings: TrainConfig, begin: Begin, on_stage: OnStage = silent
 ) -> dict[str, Tried]:
     """What photos held back gain by each of the LOOKS of a formation, beside those before it that pay."""
-    found, kept = dict[str, Tried](), [kind for kind in DEVICES if kind in _kinds(settings)]
-    for look in LOOKS:
-        if look.kind not in _kinds(settings) or len(scene.train) <= EACH or not len(scene.points):
+    found, kept = dict[str, Tried](), list[str]()
+    for group in LOOKS:
+        asked = [kind for kind in group.kinds if kind in _kinds(settings)]
+        if not asked or len(scene.train) <= EACH or not len(scene.points):
             continue
-        views = [shrunk(scene.train[k], look.side) for k in evenly(len(scene.train), look.photos)]
+        views = [shrunk(scene.train[k], group.side) for k in evenly(len(scene.train), group.photos)]
         views.sort(key=lambda view: view.device)  # some of each camera's are held back
-        held = {k: views[k] for k in range(OFFSETS[0], len(views), look.each)}
+        held = {k: views[k] for k in range(OFFSETS[0], len(views), group.each)}
         halves = [_half_shown(view) if k in held else view for k, view in enumerate(views)]
-        run = begin(replace(scene, train=halves, test=[]), _settings(settings, len(views), NONE, look.steps))
-        told = _Told(on_stage, f"learning {look.kind}", 2 * look.steps)
-        without, with_it = (_with_looks(run, kinds, held, told) for kinds in (kept, [*kept, look.kind]))
-        if (tried := _of_gains(with_it - without)) is not None:
-            found[look.kind] = tried
-            kept += [look.kind] if tried.helps else []
+        config = _settings(settings, len(views), NONE, group.steps)
+        run = begin(replace(scene, train=halves, test=[]), config)
+        told = _Told(on_stage, f"learning {', '.join(asked)}", group.steps * (1 + len(asked)))
+        best = _with_looks(run, kept, held, told)
+        for kind in asked:
+            others = _with_looks(run, [*kept, kind], held, told)
+            if (tried := _of_gains(others - best)) is not None:
+                found[kind] = tried
+                best, kept = (others, [*kept, kind]) if tried.helps else (best, kept)
     return found
 
 
