@@ -17,7 +17,17 @@ from typing import Any, NamedTuple
 from hqgs.base.left_out import CORRECTION
 from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
-from hqgs.photos.formula import ERRORS, FILM, LEARNED, LINEAR, NONE, Degradation, parse_formation, undegraded
+from hqgs.photos.formula import (
+    DEVICES,
+    ERRORS,
+    FILM,
+    LEARNED,
+    LINEAR,
+    NONE,
+    Degradation,
+    parse_formation,
+    undegraded,
+)
 from hqgs.training.config import (
     AUTO,
     AUTOMATIC,
@@ -234,7 +244,9 @@ def bound_of_few(draft: Draft) -> int:
     gained up to 1.1 dB; better cameras bear more.
     """
     facts = draft.facts
-    few = draft.formed and draft.kinds <= {"exposure"} and facts.found and facts.photos <= FEW_PHOTOS
+    few = (
+        draft.formed and draft.kinds <= {"exposure", *DEVICES} and facts.found and facts.photos <= FEW_PHOTOS
+    )
     most = max(40 * facts.points, facts.pixels // 50)
     return most if few else draft.settings.densify.max_gaussians
 
