@@ -165,8 +165,8 @@ def lengths(runs: DataFrame) -> str:
 
 
 def parts_table(runs: DataFrame) -> str:
-    """A line for each part that was measured, the largest gain first."""
-    body = list[tuple[float, list[str]]]()
+    """A line for each part that is on anywhere, the largest gain first; then the names of the others."""
+    body, off = list[tuple[float, list[str]]](), list[str]()
     for label in dict.fromkeys(runs["row"]):
         mine = pick(runs, row=label)
         if label == ALL or label not in PARTS:  # that have left
@@ -175,12 +175,16 @@ def parts_table(runs: DataFrame) -> str:
             gains_of(runs, label, name) for name in ("psnr", "ssim", "cpu_seconds", "placed")
         )
         scenes = mine.groupby("scene")["on"].any()
+        if not scenes.any():
+            off.append(label)
+            continue
         cells = [f"{label}: {mine['what'].iloc[-1]}", number(mine["lines"].max() or None, ".0f")]
         cells += [f"{scenes.sum():.0f} of {len(scenes)}", psnr.text(), ssim.text("+.3f")]
         cells += [number(seconds.mean, "+.0f"), number(placed.runs["gain"].sum() or None, "+.0f")]
         body.append((psnr.mean if psnr.count else float("-inf"), cells))
     heads = ("part", "lines", "on in", "PSNR (dB)", "SSIM", "CPU (s)", "photos placed")
-    return table(heads, [cells for _, cells in sorted(body, key=lambda one: -one[0])])
+    lines = table(heads, [cells for _, cells in sorted(body, key=lambda one: -one[0])])
+    return f"{lines}\n\nOff in all of these runs: {and_list(off)}." if off else lines
 
 
 def run(args: argparse.Namespace) -> list[str]:
