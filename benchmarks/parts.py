@@ -167,22 +167,32 @@ def lengths(runs: DataFrame) -> str:
 def parts_table(runs: DataFrame) -> str:
     """A line for each part that is on anywhere, the largest gain first; then the names of the others."""
     body, off = list[tuple[float, list[str]]](), list[str]()
+    some_lost = runs.groupby("scene")["placed"].nunique().max() > 1  # without a part of poses
     for label in dict.fromkeys(runs["row"]):
         mine = pick(runs, row=label)
         if label == ALL or label not in PARTS:  # that have left
             continue
-        psnr, ssim, seconds, placed = (
-            gains_of(runs, label, name) for name in ("psnr", "ssim", "cpu_seconds", "placed")
-        )
         scenes = mine.groupby("scene")["on"].any()
         if not scenes.any():
             off.append(label)
             continue
+        psnr, ssim, seconds, placed = (
+            gains_of(runs, label, name) for name in ("psnr", "ssim", "cpu_seconds", "placed")
+        )
         cells = [f"{label}: {mine['what'].iloc[-1]}", number(mine["lines"].max() or None, ".0f")]
         cells += [f"{scenes.sum():.0f} of {len(scenes)}", psnr.text(), ssim.text("+.3f")]
-        cells += [number(seconds.mean, "+.0f"), number(placed.runs["gain"].sum() or None, "+.0f")]
+        cells += [number(seconds.mean, "+.0f")]
+        cells += [number(placed.runs["gain"].sum(), "+.0f")] if some_lost else []
         body.append((psnr.mean if psnr.count else float("-inf"), cells))
-    heads = ("part", "lines", "on in", "PSNR (dB)", "SSIM", "CPU (s)", "photos placed")
+    heads = (
+        "part",
+        "lines",
+        "on in",
+        "PSNR (dB)",
+        "SSIM",
+        "CPU (s)",
+        *(["photos placed"] if some_lost else []),
+    )
     lines = table(heads, [cells for _, cells in sorted(body, key=lambda one: -one[0])])
     return f"{lines}\n\nOff in all of these runs: {and_list(off)}." if off else lines
 
