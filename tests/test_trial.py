@@ -178,7 +178,7 @@ def test_a_look_is_kept_where_photos_held_back_gain_by_it() -> None:
     asked = replace(ASKED, hqgs=replace(ASKED.hqgs, formation=formation))
     found = trial.tried_looks(replace(scene, train=train), asked, begin, stages.append)  # type: ignore[arg-type]
     assert [run.tried for run in runs] == [[*FakeLooks.off], [*FakeLooks.blurred]]
-    assert {name: tried.helps for name, tried in found.items()} == {
+    assert {name: tried.keeps(name) for name, tried in found.items()} == {
         "exposure": True, "vignetting": False, "response": True, "shake": True,
     }  # fmt: skip
     assert found["exposure"].gain == pytest.approx(20 * np.log10(2), abs=0.6)
@@ -290,3 +290,10 @@ def test_a_branch_comes_to_what_a_run_by_its_plan_comes_to() -> None:
     assert len(ends[2][0]) != len(ends[3][0])
     for one, other in ((0, 3), (1, 2)):
         assert all(map(torch.equal, ends[one], ends[other]))
+
+
+def test_what_cameras_do_is_left_out_only_where_it_harms() -> None:
+    """Short runs differ by more than vignetting gains: a cat with 0.8 of it gains 0.6 dB, but not there."""
+    for sure, exposure, vignetting in ((1.5, True, True), (-0.5, False, True), (-1.5, False, False)):
+        tried = Tried(0.01 * sure, 0.01, 5, sure)
+        assert (tried.keeps("exposure"), tried.keeps("vignetting")) == (exposure, vignetting)

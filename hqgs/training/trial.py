@@ -132,7 +132,7 @@ def tried_looks(
             others = _with_looks(run, [*kept, kind], held, told)
             if (tried := _of_gains(others - best)) is not None:
                 found[kind] = tried
-                best, kept = (others, [*kept, kind]) if tried.helps else (best, kept)
+                best, kept = (others, [*kept, kind]) if tried.keeps(kind) else (best, kept)
     return found
 
 
