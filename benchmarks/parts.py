@@ -173,7 +173,7 @@ def parts_table(runs: DataFrame) -> str:
         if label == ALL or label not in PARTS:  # that have left
             continue
         scenes = mine.groupby("scene")["on"].any()
-        if not int(scenes.sum()):
+        if not scenes.to_numpy().any():
             off.append(label)
             continue
         psnr, ssim, seconds, placed = (
