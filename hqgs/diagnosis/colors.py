@@ -40,7 +40,10 @@ OPPONENTS = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [
 # What a look changes at most, from which on it is learned: 0.1 of the logarithm of the light in the corner,
 # as much as colours that depend on the direction feign; 4 of 255 levels; SURE standard errors above both.
 LEAST = {"vignetting": 0.1, "response": 4 / 255}
-MOST = {"vignetting": MOST_FALL, "response": STEEPEST / 4}  # beyond, no lens and no sensor does so
+MOST: dict[str, float] = {
+    "vignetting": MOST_FALL,
+    "response": STEEPEST / 4,
+}  # beyond, no lens and no sensor does so
 SURE = 3
 DEVICE_PHOTOS, DEVICES_MOST = 4, 16  # that a camera must have taken; cameras that are told apart
 ROWS = 12_000  # colours of points in photos that are looked at
