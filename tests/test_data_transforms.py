@@ -322,7 +322,10 @@ def test_ply_without_colours_and_with_points_that_are_not_finite(tmp_path: Path)
     scene = load_scene(tmp_path)
     np.testing.assert_array_equal(scene.points, points[[0, 3]].astype(np.float32))
     np.testing.assert_array_equal(scene.point_colors, np.full((2, 3), 128))
-    assert scene.notes[0] == "2 of 4 points are NaN or Inf and were left out"
+    assert scene.notes == [
+        "2 of 4 points are NaN or Inf and were left out",
+        "the points have one colour: whether photos show them where they are was not checked",
+    ]
 
 
 HEADER = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\n{}end_header\n"

@@ -185,13 +185,15 @@ class Devices:
 
 
 class Sign(NamedTuple):
-    """What a kind of look changes at most, of the camera of which that is surest."""
+    """What a kind of look changes at most, of the camera of which that is surest.
+
+    Vignetting: of the logarithm of light in the corner, above 0 where it is darker. Response: of a value of
+    0 to 1.
+    """
 
     kind: str
-    size: (
-        float  # vignetting: of the logarithm of light in the corner, above 0 where it is darker; response: of
-    )
-    error: float  # a value, white is 1. Its standard error.
+    size: float
+    error: float  # its standard error
 
     @property
     def least(self) -> float:

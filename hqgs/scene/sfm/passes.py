@@ -41,8 +41,8 @@ from hqgs.scene.sfm.refine import placed_names, refined
 from hqgs.scene.sfm.refine.agree import Agreement, loose_parts
 
 ALMOST = 0.95  # of the photos: with fewer, they are looked at again, more closely
-COARSE, FINE = 2048, 4096  # features of a photo (before those with two directions count twice), where they
-# are found in little time
+# Features of a photo in short runs, before those with two directions count twice.
+COARSE, FINE = 2048, 4096
 BORNE_OUT = 0.78  # of the matches, by places found at once: 0.81 to 1 where right, 0.72 and 0.74 where wrong
 TRIED, GAIN = 6, 1.2  # photos by which a closer look is tried first; times the matches that it must bring
 TRIALS = 1000  # of RANSAC for each pair's geometry; COLMAP's 30,000 took 20 minutes of a corridor and told
@@ -59,10 +59,8 @@ class Pass:
 
     name: str
     enough: float = ALMOST
-    coarse: bool = (
-        False  # photos as large as they are; else SIFT looks at them at twice their size, which takes
-    )
-    # three quarters of its time
+    # Photos as large as they are; else SIFT looks at them at twice their size: three quarters of its time.
+    coarse: bool = False
     sigmas: tuple[float, ...] = (0.0,)  # px of what SIFT sees: smoothed versions whose features join
     tolerant: bool = False  # weaker features, and fewer matches are enough
 

@@ -28,8 +28,6 @@ DIMMEST = 0.01
 HIDDEN = 64  # units of the one hidden layer of an MLP; the paper names no size
 FEATURES = 1000  # F, the rows of F'
 XYZ = 3  # F' feeds the sigmoid directly, so every feature has one number for each coordinate
-# Sobel sums of equal numbers differ by rounding alone up to about this, times the largest |value|. 8-bit
-# photos have steps of at least 1/255, far above it.
 
 
 @dataclass(frozen=True)
@@ -259,6 +257,7 @@ def edge_magnitude(image: Tensor, mask: Tensor | None = None) -> Tensor:
     else:
         inside, counted = None, magnitude
     low, high = counted.amin(), counted.amax()
+    # Sobel sums of equal numbers differ so much by rounding alone; 8-bit photos have steps of 1/255 at least.
     if high - low <= 1e-5 * values.abs().amax():
         return torch.zeros_like(values)
     # A pixel outside the mask may lie outside the range; it gets 0 below.
