@@ -60,7 +60,9 @@ def written(out: Path, *views: RenderedView, **changes: Any) -> Report:
         "learned": [],
         "plan": [],
     }
-    return write_report(out, cast(RunRecord, record | changes), list(views))
+    got = write_report(out, cast(RunRecord, record | changes), list(views))
+    assert {key: got[key] for key in record} == record | changes
+    return got
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -262,7 +264,8 @@ def test_each_view_is_rendered_once_and_few_are_held() -> None:
 def test_a_bad_view_is_named(tmp_path: Path) -> None:
     bad = RenderedView("b.jpg", np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.float32))
     with pytest.raises(ValueError, match=r"view 'b.jpg': render has shape \[4, 5, 3\]"):
-        written(tmp_path, view_of("a"), bad)
+        written(tmp_path / "out", view_of("a"), bad)
+    assert not (tmp_path / "out").exists()
 
 
 def test_scene_without_held_out_views_gets_a_report(tmp_path: Path) -> None:

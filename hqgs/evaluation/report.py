@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hqgs.base.files import PICTURES, REPORT, write_json
+from hqgs.base.files import PICTURES, REPORT, missing_folders, remove_empty, write_json
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.evaluation.constants import AMPLIFICATION, CONFIDENCE, MASKED
 from hqgs.evaluation.held_out import RenderedView, measured, names_of
@@ -39,23 +39,27 @@ def write_report(out: Path | None, record: RunRecord, views: Sequence[RenderedVi
     if out is None:
         return _report(record, names_of(views), measured(views), [None] * len(views))
     pictures = [f"{PICTURES}/{file}" for file in _file_names(names_of(views))]
+    made = missing_folders(out)
     out.mkdir(parents=True, exist_ok=True)
     for leftover in out.glob(".report.*"):  # of a run that was killed
         shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()  # a page is a file
-    with tempfile.TemporaryDirectory(dir=out, prefix=".report.") as name:
-        stage = Path(name)
-        (stage / PICTURES).mkdir()
+    try:
+        with tempfile.TemporaryDirectory(dir=out, prefix=".report.") as name:
+            stage = Path(name)
+            (stage / PICTURES).mkdir()
 
-        def draw(number: int, view: RenderedView, metrics: ViewMetrics) -> None:
-            comparison_picture(view, metrics).save(stage / pictures[number], compress_level=2)
+            def draw(number: int, view: RenderedView, metrics: ViewMetrics) -> None:
+                comparison_picture(view, metrics).save(stage / pictures[number], compress_level=2)
 
-        report = _report(record, names_of(views), measured(views, draw), pictures)
-        write_json(stage / REPORT, report)
+            report = _report(record, names_of(views), measured(views, draw), pictures)
+            write_json(stage / REPORT, report)
 
-        (out / PICTURES).mkdir(exist_ok=True)
-        (out / REPORT).unlink(missing_ok=True)  # from here on the old report has lost its pictures
-        for file in (*pictures, REPORT):
-            (stage / file).replace(out / file)
+            (out / PICTURES).mkdir(exist_ok=True)
+            (out / REPORT).unlink(missing_ok=True)  # from here on the old report has lost its pictures
+            for file in (*pictures, REPORT):
+                (stage / file).replace(out / file)
+    finally:
+        remove_empty(made)  # after an error
     return report
 
 
