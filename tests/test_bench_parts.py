@@ -86,7 +86,7 @@ def test_a_part_gains_only_where_it_is_on() -> None:
         what="flat",
     )
     assert (gains_of(runs, "discs").mean, gains_of(runs, "discs").count) == (1.0, 1)
-    assert "| discs: flat | 7 | 1 of 2 | +1.00 | +0.000 | +0 |" in parts_table(runs)
+    assert "| discs: flat | 7 | 1 of 2 | +1.00 | – | – | +0.000 | +0 |" in parts_table(runs)
 
 
 # --- `all`: every study behind the pages is run once, and its lines take the place of those of the pages

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from pandas import DataFrame
 
@@ -100,6 +101,7 @@ def gain(
 ) -> Gain:
     """Differences, or ratios, of two rows in the runs with these values."""
     frame = pick(frame, **wanted)
+    frame = frame if value in frame else frame.assign(**{value: np.nan})  # not measured yet
     sides = [frame.loc[frame["row"] == label].set_index(GROUP)[value] for label in (row, base)]
     first, second = (side.dropna().astype(float) for side in sides)
     joined = pd.concat([first, second], axis=1, join="inner", keys=["a", "b"])
