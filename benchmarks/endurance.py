@@ -1,12 +1,11 @@
-"""The benchmark `endurance`: long runs, some of them on hostile scenes: no NaN, memory flat, budget kept."""
+"""The benchmark `endurance`: long runs, one of them with hostile rates: no NaN, memory flat, budget kept."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,58 +23,17 @@ from hqgs.training.forward import Step
 from hqgs.training.trainer import TrainingError
 
 RECORDS = 20  # in the course of a run
-NOISE_SHARE = 0.3  # of the training photos
 LIMIT_MB = 1.0  # growth of the peak memory per 1,000 iterations, once the number of Gaussians is fixed
 SHORTEST = 1_000  # iterations over which such a growth can be told from chance
 
 
-def noise_photos(scene: Scene) -> Scene:
-    """The scene with uniform noise in place of NOISE_SHARE of its training photos, evenly spread."""
-    count = round(NOISE_SHARE * len(scene.train))
-    chosen = set(np.linspace(0, len(scene.train) - 1, count).round().astype(int).tolist())
-    rng = np.random.default_rng(0)
-    train = [
-        replace(view, image=rng.integers(0, 256, view.image.shape, np.uint8)) if k in chosen else view
-        for k, view in enumerate(scene.train)
-    ]
-    return replace(scene, train=train)
-
-
-def identical_cameras(scene: Scene) -> Scene:
-    """The scene with its first training view, twice."""
-    first = scene.train[0]
-    return replace(scene, train=[first, replace(first, name=f"again {first.name}")])
-
-
-PHOTOS: dict[str, Callable[[Scene], Scene]] = {
-    "": lambda scene: scene,
-    "noise": noise_photos,
-    "one": lambda scene: replace(scene, train=scene.train[:1]),
-    "twins": identical_cameras,
-}
-
-
 @dataclass(frozen=True)
 class Case(Row):
-    """What is done to the scene and to the configuration."""
-
-    photos: Literal["", "noise", "one", "twins"] = ""
-
-    @property
-    def more(self) -> dict[str, Any]:
-        return {"photos": self.photos}
+    """A run whose growth ends after half of it, so that the memory can be judged in the other half."""
 
     def train_config(self, seed: int, iterations: int, changes: dict[str, Any] | None = None) -> TrainConfig:
-        """Growth ends after half of the run, so that the memory can be judged in the other half.
-
-        A case that asks for opacity resets has some in a short run, too.
-        """
         config = super().train_config(seed, iterations, changes)
-        stop = iterations // 2
-        densify = replace(config.densify, stop=stop)
-        if "densify" in self.config:
-            densify = replace(densify, reset_every=min(densify.reset_every, max(1, stop // 4)))
-        return replace(config, densify=densify)
+        return replace(config, densify=replace(config.densify, stop=iterations // 2))
 
 
 PROTOCOLS = read_protocols(Path(__file__).with_suffix(".toml"), Case)
@@ -95,8 +53,8 @@ JUDGED = ["iteration", "gaussians", "values_not_finite", "losses_not_finite", "p
 
 
 def measure(cell: Cell, scene: Scene) -> Run:
-    """Train the case of a cell on what it makes of the scene, which the cases share."""
-    return run_case(PHOTOS[cell.row.more["photos"]](scene), cell.config)[0]
+    """Train the case of a cell."""
+    return run_case(scene, cell.config)[0]
 
 
 def run_case(scene: Scene, config: TrainConfig) -> tuple[Run, list[dict[str, Any]]]:
@@ -167,5 +125,5 @@ def run(args: argparse.Namespace) -> list[str]:
     return [*([listed(runs, SHOWN)] if len(runs) else []), words, *study.missing()]
 
 
-HELP = "long runs on easy and hostile scenes: no NaN, flat memory, a bounded size"
+HELP = "long runs with usual and hostile rates: no NaN, flat memory, a bounded size"
 BENCHMARK = Benchmark(HELP, run, PROTOCOLS)

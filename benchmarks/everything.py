@@ -1,27 +1,28 @@
 """`all`: every study behind the pages, in processes of their own, and then the pages.
 
 What is finished with the present sources is not run again: the studies keep their lines, and the table
-`studies.csv` says which studies are done. The lines that other programs gave stay.
+`studies.csv` says which studies are done. Those of one thread run side by side, the others alone.
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
-import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from shutil import copyfile
+from subprocess import Popen
 
 from benchmarks.pages import write as pages
-from benchmarks.pages.sections import EXTERNAL
 from benchmarks.rows import KEYS, Table, facts
 from benchmarks.study import sources
 from hqgs.cli.progress import duration
 
 HELP = "run every study behind the pages that is not finished, then write the pages"
-DONE = "studies.csv"
+DONE, ONE_CORE = "studies.csv", "--threads 1"
+PAUSE = 0.2  # seconds between looks at what runs
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -29,6 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--captures", type=Path, metavar="DIR", help="of the captures, a folder each: fern, fox, ...")
     add("--out", type=Path, default=Path("out", "all"), metavar="DIR", help="for the tables (%(default)s)")
+    add("--jobs", type=int, default=1, metavar="N", help="studies of one thread side by side (%(default)s)")
     add("--only", nargs="+", metavar="STUDY", help=f"of: {', '.join(pages.STUDIES)}")
     add("--quick", action="store_true", help="each benchmark once in seconds, no pages: only a test")
     pages.add_docs(parser)
@@ -63,40 +65,62 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
 
 
 def publish(out: Path, results: Path) -> None:
-    """Put the lines of `out` in the place of those of the pages' tables; rows of other programs stay."""
-    for name in KEYS:
-        lines = Table(out / f"{name}.csv").rows()
-        if lines:
-            table = Table(results / f"{name}.csv")
-            table.keep(lambda line: line.get("row") in EXTERNAL)
-            table.put(lines)
+    """Put the tables of `out` in the place of the pages'."""
+    results.mkdir(parents=True, exist_ok=True)
+    for path in [out / f"{name}.csv" for name in KEYS]:
+        if path.is_file():
+            copyfile(path, results / path.name)
 
 
 def run(args: argparse.Namespace) -> list[str]:
     """Run what is not finished; returns what is left to do, or what was written."""
-    done = Table(args.out / DONE, ("study",))
+    done, wanted = Table(args.out / DONE, ("study",)), commands(args)
+    known = {line["study"] for line in done.rows() if line["sources"] == sources()}
+    missing = {name: words for name, words in wanted.items() if name not in known}
+    beside = {name: words for name, words in missing.items() if ONE_CORE in shlex.join(words)}
+    alone = {name: words for name, words in missing.items() if name not in beside}  # they measure time
     left: list[str] = []
-    for name, words in commands(args).items():
-        line = done.find({"study": name})
-        if line is not None and line["sources"] == sources():
-            continue
-        print(f"all: {name}: {shlex.join(words)}", file=sys.stderr, flush=True)
-        started = time.perf_counter()
-        code = call([*words, "--out", str(args.out)])
-        if code == 130:
-            raise KeyboardInterrupt
-        seconds = time.perf_counter() - started
-        print(f"all: {name}: exit code {code}, {duration(seconds)}", file=sys.stderr, flush=True)
-        if code == 0:
-            done.put([{"study": name, "seconds": seconds} | facts() | {"sources": sources()}])
-        else:
-            left.append(f"{name}: exit code {code}")
+    for studies, jobs in ((beside, args.jobs), (alone, 1)):
+        for name, code, seconds in side_by_side(studies, jobs, ["--out", str(args.out)]):
+            if code == 130:
+                raise KeyboardInterrupt
+            say(f"{name}: exit code {code}, {duration(seconds)}")
+            if code == 0:
+                done.put([{"study": name, "seconds": seconds} | facts() | {"sources": sources()}])
+            else:
+                left.append(f"{name}: exit code {code}")
     if left or args.quick or args.only is not None:
         return [*left, f"tables: {args.out}; no pages were written"]
     publish(args.out, args.docs / pages.RESULTS)
     return [f"written: {path}" for path in pages.write(args.docs / pages.RESULTS, args.docs)]
 
 
-def call(words: Sequence[str]) -> int:
-    """The exit code of a benchmark in a process of its own, whose memory is its own."""
-    return subprocess.run([sys.executable, "-m", "benchmarks", *words], check=False).returncode
+def side_by_side(
+    studies: Mapping[str, list[str]], jobs: int, more: Sequence[str]
+) -> Iterator[tuple[str, int, float]]:
+    """Run studies, so many at a time; the name, exit code and seconds of each as it ends."""
+    left, running = list(studies), dict[str, tuple[Popen[bytes], float]]()
+    try:
+        while left or running:
+            while left and len(running) < jobs:
+                name = left.pop(0)
+                say(f"{name}: {shlex.join(studies[name])}")
+                running[name] = start([*studies[name], *more]), time.perf_counter()
+            time.sleep(PAUSE)
+            for name, (process, started) in list(running.items()):
+                if (code := process.poll()) is not None:
+                    del running[name]
+                    yield name, code, time.perf_counter() - started
+    finally:
+        for process, _ in running.values():
+            process.terminate()
+            process.wait()
+
+
+def start(words: Sequence[str]) -> Popen[bytes]:
+    """A benchmark in a process of its own, whose memory is its own."""
+    return Popen([sys.executable, "-m", "benchmarks", *words])
+
+
+def say(text: str) -> None:
+    print(f"all: {text}", file=sys.stderr, flush=True)

@@ -18,13 +18,12 @@ from typing import Any
 
 import grimp
 import numpy as np
-import pandas as pd
 from pandas import DataFrame
 
 from benchmarks.command import Benchmark
 from benchmarks.measure import Run, Training
 from benchmarks.pages.figures import and_list, gain, number, pick, table
-from benchmarks.protocol import Row, narrowed, read_protocols
+from benchmarks.protocol import Row, read_protocols
 from benchmarks.rows import text_of
 from benchmarks.study import Cell, Study, begin
 from benchmarks.without import without
@@ -37,7 +36,6 @@ from hqgs.training.trainer import Trainer
 
 ALL = "all"
 MEASURES = ("psnr", "psnr_aligned", "psnr_shown", "ssim", "cpu_seconds", "placed", "gaussians")
-SMALL, AGAIN = 0.3, 1  # dB: a part that gains less is measured with this seed, too
 
 
 @dataclass(frozen=True)
@@ -217,22 +215,12 @@ def parts_table(runs: DataFrame) -> str:
 
 
 def run(args: argparse.Namespace) -> list[str]:
-    """Train what is not finished; parts that gain little with a second seed, where they are on."""
+    """Train what is not finished."""
     rows = None if args.rows is None else list(dict.fromkeys([ALL, *args.rows]))
     study = begin(args, PROTOCOLS, rows=rows)
     study.train(Parts(study).measure)
-    runs, missing = study.frame(), study.missing()
-    first = pick(runs, seed=study.protocol.seeds[0])
-    found = {label: gains_of(first, label) for label in study.protocol.labels if label != ALL and len(runs)}
-    unsure = [label for label, one in found.items() if one.count and one.mean < SMALL]
-    if unsure and not args.quick and args.seeds is None:
-        protocol = narrowed(study.protocol, rows=[ALL, *unsure], seeds=(AGAIN,))
-        again = Study(args, study.name, protocol, study.scenes)
-        on = {(line["scene"], line["row"]) for _, line in first.loc[first["on"].astype(bool)].iterrows()}
-        again.cells = [cell for cell in again.cells if (cell.scene.name, cell.row.label) in on]
-        again.train(Parts(again).measure)
-        runs, missing = pd.concat([runs, again.frame()]), [*missing, *again.missing()]
-    return [*([parts_table(runs)] if len(runs) else []), *missing]
+    runs = study.frame()
+    return [*([parts_table(runs)] if len(runs) else []), *study.missing()]
 
 
 OPTIONS = {"--degradations": {"nargs": "+", "metavar": "KIND", "help": "done to the photos first (none)"}}

@@ -21,9 +21,6 @@ from hqgs.training.trainer import Trainer
 
 Place = tuple[Any, str]  # a module or class, and the name that its users look up there
 
-# Replaced by a rival's.
-RENDER_VIEW: Place = (forward, "render_view")
-
 # Replaced with other knobs, and timed by benchmarks/speed with the stage that they make up.
 PROJECT: Place = (_rust, "project_forward")
 COMPOSITE: Place = (_rust, "composite_forward")
@@ -43,7 +40,7 @@ def parts_of_step(trainer: Trainer) -> dict[Place, str]:
     state, (project, composite, *backward) = trainer.state, CRATE.items()
     return dict(
         [
-            (RENDER_VIEW, "activations"),  # of the Gaussians, and the checks of hqgs.rasterization
+            ((forward, "render_view"), "activations"),  # and the checks of hqgs.rasterization
             ((type(trainer.method), "modulate"), "method"),  # before they are rasterized
             project,
             composite,

@@ -76,7 +76,6 @@ class Protocol:
     degradations: tuple[str, ...] = (NONE,)  # as `parse_degradation` reads them
     baseline: str = ""  # the row that the others are compared with
     seeds: tuple[int, ...] = (0,)  # of the training and of the degradation
-    one_scene: bool = False  # the first that is given
     embedded: tuple[int, int, int] = (504, 378, 24)  # width, height in px, views of the built-in scene
     config: dict[str, Any] = field(default_factory=dict)  # changes of every row's `TrainConfig`
     repeats: int = 1  # rounds of what is timed after the training

@@ -10,7 +10,7 @@ import hashlib
 import io
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -110,11 +110,6 @@ class Table:
         with self._lock():
             self._write(list((self.lines() | {self.key_of(line): line for line in added}).values()))
         return added
-
-    def keep(self, wanted: Callable[[Row], bool]) -> None:
-        """Remove all other lines."""
-        with self._lock():
-            self._write([line for line in self.rows() if wanted(line)])
 
     def frame(self, rows: Sequence[Row] | None = None) -> DataFrame:
         """The lines, or these of them, with numbers as numbers; NaN where there is none."""

@@ -205,9 +205,7 @@ def chosen(
     options = ("degradations", "rows", "seeds", "iterations", "downscale", "repeats", "photos")
     given = {option: vars(args).get(option) for option in options} | changes
     protocol = narrowed(protocols[name], **given)
-    folders = args.scenes[:1] if protocol.one_scene else args.scenes
-    cache = args.out / "scenes"
-    return protocol, load_scenes(folders, protocol, cache, args.validate)
+    return protocol, load_scenes(args.scenes, protocol, args.out / "scenes", args.validate)
 
 
 def begin(args: argparse.Namespace, protocols: Mapping[str, Protocol], **changes: Any) -> Study:

@@ -112,18 +112,48 @@ def test_each_benchmark_has_a_study() -> None:
     assert {shlex.split(options)[0] for options in STUDIES.values()} == set(cli.BENCHMARKS)
 
 
+class Ended:
+    """A process."""
+
+    def __init__(self, *codes: int | None) -> None:
+        self.codes = list(codes)
+
+    def poll(self) -> int | None:
+        return self.codes.pop(0)
+
+    def terminate(self) -> None:
+        self.codes = [130]
+
+    def wait(self) -> int:
+        return self.codes[0] or 0
+
+
+def test_studies_of_one_thread_run_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    course = {"a": Ended(None, None, 0), "b": Ended(None, 0), "c": Ended(None), "d": Ended(0)}
+    started = list[str]()
+    monkeypatch.setattr(everything, "start", lambda words: started.append(words[0]) or course[words[0]])
+    monkeypatch.setattr(everything, "PAUSE", 0)
+    studies = everything.side_by_side({name: [name] for name in course}, 2, [])
+    assert (next(studies)[:2], started) == (("b", 0), ["a", "b"])
+    assert (next(studies)[:2], started) == (("a", 0), ["a", "b", "c"])
+    studies.close()  # by Ctrl-C
+    assert course["c"].codes == [130]
+    assert started == ["a", "b", "c"]
+
+
 def test_what_is_done_is_not_run_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     called: list[str] = []
     codes = {"speed": 1}
 
-    def call(words: list[str]) -> int:
+    def start(words: list[str]) -> Ended:
         called.append(words[0])
         assert words[1:] == ["--quick", "--out", str(tmp_path)]
-        return codes.get(words[0], 0)
+        return Ended(codes.get(words[0], 0))
 
-    monkeypatch.setattr(everything, "call", call)
+    monkeypatch.setattr(everything, "start", start)
+    monkeypatch.setattr(everything, "PAUSE", 0)
     options = ["all", "--quick", "--out", str(tmp_path)]
     assert cli.main(options) == 0
     assert sorted(called) == sorted(cli.BENCHMARKS)
@@ -141,11 +171,11 @@ def test_what_is_done_is_not_run_again(
 
 def test_studies_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["all", "--only", "grd", "--out", str(tmp_path)]) == 2
-    assert "only: there is no 'grd'; there are: first, embedded" in capsys.readouterr().err
+    assert "only: there is no 'grd'; there are: standard, others" in capsys.readouterr().err
 
 
 def test_pages_are_written_when_all_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(everything, "call", lambda words: 0)
+    monkeypatch.setattr(everything, "start", lambda words: Ended(0))
     monkeypatch.setattr(everything.pages, "STUDIES", {"speed": "speed"})
     monkeypatch.setattr(everything.pages, "write", lambda tables, docs: [docs / "results.md"])
     out, docs = tmp_path / "out", tmp_path / "docs"
@@ -154,16 +184,14 @@ def test_pages_are_written_when_all_is_done(tmp_path: Path, monkeypatch: pytest.
     assert Table(docs / "results" / "speed.csv").rows() == Table(out / "speed.csv").rows()
 
 
-def test_new_lines_take_the_place_of_old_ones(tmp_path: Path) -> None:
-    """What another program printed stays, and a table without new lines as it is."""
+def test_new_tables_take_the_place_of_old_ones(tmp_path: Path) -> None:
+    """A table without new lines stays as it is."""
     old, new = tmp_path / "old", tmp_path / "new"
-    Table(old / "time.csv").put([line("3dgs", 1.0), line("gone", 2.0), line("OpenSplat", 3.0)])
+    Table(old / "time.csv").put([line("3dgs", 1.0), line("gone", 2.0)])
     Table(old / "quality.csv").put([line("3dgs", 4.0)])
     Table(new / "time.csv").put([line("3dgs", 5.0)])
     publish(new, old)
-    assert [(row["row"], row["psnr"]) for row in Table(old / "time.csv").rows()] == [
-        ("OpenSplat", "3"), ("3dgs", "5"),
-    ]  # fmt: skip
+    assert [(row["row"], row["psnr"]) for row in Table(old / "time.csv").rows()] == [("3dgs", "5")]
     assert [row["psnr"] for row in Table(old / "quality.csv").rows()] == ["4"]
     assert not [path for path in old.iterdir() if path.suffix != ".csv"]
 

@@ -41,7 +41,7 @@ def degrade(text: str, image: NDArray[np.uint8] | NDArray[np.float32], seed: int
     [
         *("none", "jpeg:5", "noise:0.5", "lowres:4", "blur", "blur:2.5", "defocus", "motion:21", "mixed"),
         *("blur:2+jpeg:20", "jpeg:20+blur:2", "blur+lowres:2+noise:10"),
-        *("shake", "shake:7.5", "exposure:0.5", "chat:640", "phone", "phone:3", "video:23", "video265"),
+        *("shake", "shake:7.5", "exposure:0.5", "chat:640", "phone", "phone:3", "video:23"),
         *("some:shake", "some:noise:25", "some:blur+jpeg:30", "shake+exposure+video:30"),
     ],
 )

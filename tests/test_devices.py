@@ -16,7 +16,6 @@ from test_learned_cameras import learned_config
 from tiny_scene import tiny_scene
 
 import hqgs
-from benchmarks.scenes.devices import draw_devices
 from hqgs.cli.main import main
 from hqgs.diagnosis.colors import (
     LEAST,
@@ -330,18 +329,3 @@ def test_a_new_view_in_the_look_of_a_photo(tmp_path: Path, capsys: pytest.Captur
     assert look_of(out, "view1").response.any()  # alone
     (out / "report.json").unlink()
     assert main(["render", str(out), "--out", str(tmp_path / "x"), "--look", "view1"]) == 2
-
-
-def test_the_built_in_cameras() -> None:
-    devices = draw_devices(np.random.default_rng(3), 21, 4)
-    assert sorted({device.name for device in devices}) == [f"camera {k}" for k in (1, 2, 3, 4)]
-    assert np.abs(np.mean([np.log(device.gammas) for device in devices], 0)).max() < 1e-12
-    assert np.abs(np.mean([device.contrast for device in devices], 0)).max() < 1e-12
-    values = np.repeat(np.linspace(0, 1, 257, dtype=np.float32)[:, None], 3, 1)
-    for device in devices:
-        written = device.respond(values)
-        assert (np.diff(written, axis=0) > 0).all()
-        np.testing.assert_allclose(written[[0, -1]], [[0] * 3, [1] * 3], atol=1e-6)
-        shade = device.shade(Camera(36, 24, np.array([[40.0, 0, 18], [0, 40, 12], [0, 0, 1]]), np.eye(4)))
-        assert shade[0, 0] == pytest.approx((1 + device.corner * (17.5**2 + 11.5**2) / (18**2 + 12**2)) ** -2)
-        assert shade[12, 18] > 0.99

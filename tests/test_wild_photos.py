@@ -32,7 +32,7 @@ from hqgs.photos.formula import KINDS, OWN, parse_degradation, parse_formation
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.pixels import as_floats
 
-NEW = ("shake", "exposure", "chat", "phone", "video", "video265")
+NEW = ("shake", "exposure", "chat", "phone", "video")
 NOT_TOLD = tuple(kind for kind in NEW if kind not in OWN)
 
 
@@ -305,23 +305,22 @@ def test_a_phone_stores_a_jpeg_of_its_own() -> None:
 # --- video
 
 
-@pytest.mark.parametrize("kind", ["video", "video265"])
 @pytest.mark.parametrize("size", [(45, 61), (48, 64)])
-def test_a_film_comes_back(kind: str, size: tuple[int, int]) -> None:
+def test_a_film_comes_back(size: tuple[int, int]) -> None:
     pytest.importorskip("av")
     images = [picture(*size, shift=2.0 * k) for k in range(6)]
-    frames = film(images, 10, kind)
+    frames = film(images, 10)
     assert [frame.image.shape for frame in frames] == [(*size, 3)] * 6
     for frame, image in zip(frames, images, strict=True):
         assert np.abs(frame.image - image).mean() < 0.02
     assert frames[0].kind == "I"
     assert {frame.kind for frame in frames[1:]} <= {"P", "B"}
     assert frames[0].bytes > max(frame.bytes for frame in frames[1:])
-    again = film(images, 10, kind)
+    again = film(images, 10)
     for frame, same in zip(frames, again, strict=True):
         np.testing.assert_array_equal(frame.image, same.image)
         assert (frame.kind, frame.bytes) == (same.kind, same.bytes)
-    coarse = film(images, 45, kind)
+    coarse = film(images, 45)
     assert sum(f.bytes for f in coarse) < 0.5 * sum(f.bytes for f in frames)
     loss = [np.mean([np.square(f.image - i).mean() for f, i in zip(c, images, strict=True)])
             for c in (frames, coarse)]  # fmt: skip
@@ -389,11 +388,9 @@ def test_steps_before_and_after_a_film() -> None:
 
 def test_defaults() -> None:
     text = "+".join(NEW)
-    assert str(parse_degradation(text).for_width(504)) == (
-        "shake:12+exposure:1+chat:252+phone:4+video:36+video265:36"
-    )
+    assert str(parse_degradation(text).for_width(504)) == ("shake:12+exposure:1+chat:252+phone:4+video:36")
     assert str(parse_degradation(text).for_width(252, 504)) == (
-        "shake:6+exposure:1+chat:252+phone:4+video:36+video265:36"
+        "shake:6+exposure:1+chat:252+phone:4+video:36"
     )
     assert str(parse_degradation("some:shake").for_width(252)) == "some:shake:6"
 

@@ -56,10 +56,6 @@ class Gain:
         return float(self.runs["gain"].min())
 
     @cached_property
-    def best(self) -> float:
-        return float(self.runs["gain"].max())
-
-    @cached_property
     def error(self) -> float | None:
         """Half the interval of the mean over captures, or of one over its runs; None of a single run."""
         gains: dict[str, list[float]] = {}
@@ -96,17 +92,14 @@ def capture(scene: str) -> str:
     return re.sub(r"[-:][0-9]+$", "", scene)
 
 
-def gain(
-    frame: DataFrame, row: str, base: str, value: str = "psnr", ratio: bool = False, **wanted: Any
-) -> Gain:
-    """Differences, or ratios, of two rows in the runs with these values."""
+def gain(frame: DataFrame, row: str, base: str, value: str = "psnr", **wanted: Any) -> Gain:
+    """Differences of two rows in the runs with these values."""
     frame = pick(frame, **wanted)
     frame = frame if value in frame else frame.assign(**{value: np.nan})  # not measured yet
     sides = [frame.loc[frame["row"] == label].set_index(GROUP)[value] for label in (row, base)]
     first, second = (side.dropna().astype(float) for side in sides)
     joined = pd.concat([first, second], axis=1, join="inner", keys=["a", "b"])
-    values = joined["a"] / joined["b"] if ratio else joined["a"] - joined["b"]
-    return Gain(values.rename("gain").reset_index(), base)
+    return Gain((joined["a"] - joined["b"]).rename("gain").reset_index(), base)
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -148,25 +141,13 @@ def crossed(
 
 
 def gains(
-    frame: DataFrame,
-    rows: Sequence[str],
-    base: str,
-    across: str = "degradation",
-    whole: str = "",
-    down: str = "row",
-    corner: str = "gain (dB)",
+    frame: DataFrame, rows: Sequence[str], base: str, across: str = "degradation", corner: str = "gain (dB)"
 ) -> str:
-    """Gains over the base with their scatter: a line for each row, or of one row for each value of `down`."""
+    """Gains over the base with their scatter, a line for each row; the last column: of all runs."""
     heads = list(dict.fromkeys(frame[across]))
-    labels = list(rows) if down == "row" else list(dict.fromkeys(frame[down]))
-    body = []
-    for label in labels:
-        part = frame if down == "row" else frame.loc[frame[down] == label]
-        row = label if down == "row" else rows[0]
-        line = [gain(part, row, base, **{across: head}).text() for head in heads]
-        line += [gain(part.loc[part["degradation"] != NONE], row, base).text()] if whole else []
-        body.append([str(label), *line])
-    return table([corner, *map(str, heads), *([whole] if whole else [])], body)
+    parts = [*(frame.loc[frame[across] == head] for head in heads), frame]
+    body = [[row, *(gain(part, row, base).text() for part in parts)] for row in rows]
+    return table([corner, *map(str, heads), "all"], body)
 
 
 def mean(frame: DataFrame, value: str = "psnr", form: str = ".2f") -> str:
@@ -226,18 +207,6 @@ def weakest(frame: DataFrame, row: str = "hqgs", base: str = "3dgs") -> str:
     known = {kind: one.mean for kind, one in found.items() if one.count}
     least, most = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
     return f"{least} ({known[least]:+.2f} dB), most under {most} ({known[most]:+.2f} dB)"
-
-
-def beyond(frame: DataFrame, rows: Sequence[str], base: str) -> str:
-    """Which of the rows differ from the base by more than their scatter, in words."""
-    found = {row: gain(frame, row, base) for row in rows}
-    sure = [f"{row} ({one.text()} dB)" for row, one in found.items() if one.count and one.sure]
-    verb = "differs" if len(sure) == 1 else "differ"
-    return (
-        f"{and_list(sure)} {verb} from {base} beyond scatter"
-        if sure
-        else f"none differs from {base} beyond scatter"
-    )
 
 
 def beside(

@@ -101,13 +101,7 @@ def endured(endurance: DataFrame) -> str:
 
 
 SHORT = 0.1  # dB: a level is what 3DGS ends at, less this
-OPENSPLAT, BASE = "OpenSplat", "3dgs"
-EXTERNAL = (OPENSPLAT,)  # rows of other programs, which no command here prints
-
-
-def ours(times: DataFrame) -> DataFrame:
-    """The rows that a command of this commit prints."""
-    return times.loc[~times["row"].isin(EXTERNAL)]
+BASE = "3dgs"
 
 
 def then(history: str, seconds: float) -> float | None:
@@ -246,16 +240,6 @@ def files_head(export: DataFrame) -> str:
     size = f"{first['width']:,} x {first['height']:,} px"
     what = f"{first['gaussians']:,} Gaussians of degree {first['sh_degree']}"
     return f"{first['scene'].capitalize()}, {size}, {what}."
-
-
-def listed_views(runs: DataFrame) -> str:
-    """Steps of several views beside steps of one."""
-    body = []
-    for row in dict.fromkeys(runs["row"]):
-        part, over = pick(runs, row=row), gain(runs, row, "1 view")
-        words = [mean(part, "psnr"), over.text() if row != "1 view" else "", mean(part, "ssim", ".4f")]
-        body.append([row, str(len(part)), *words, mean(part, "gaussians", ",.0f")])
-    return table(["", "runs", "PSNR (dB)", "against 1 view (dB)", "SSIM", "Gaussians"], body)
 
 
 def like_mine(runs: DataFrame, kinds: Sequence[str], words: Sequence[str]) -> str:

@@ -15,7 +15,6 @@ from PIL import Image
 
 from benchmarks.measure import Run, train
 from benchmarks.protocol import degraded_view
-from benchmarks.quality.deblur import train_deblur
 from benchmarks.study import Cell
 from hqgs.base.evenly import middles
 from hqgs.base.files import atomic_path
@@ -44,8 +43,7 @@ def run_cell(cell: Cell, photos: Scene, pictures: list[Path], fit: bool = False)
     camera from which the trained scene fits its photo best.
     Raises ValueError as `Trainer` does, and TrainingError.
     """
-    rival = bool(cell.more.get("rival"))
-    done = train_deblur(photos, cell.config) if rival else train(photos, cell.config)
+    done = train(photos, cell.config)
     views = list(done.held_out())
     mean = asdict(mean_metrics([evaluate_view(view.render, view.photo, view.mask) for view in views]))
     for view, path in zip(views, pictures, strict=False):

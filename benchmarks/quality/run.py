@@ -10,12 +10,11 @@ from benchmarks.command import Benchmark
 from benchmarks.pages.figures import crossed, gains
 from benchmarks.protocol import read_protocols
 from benchmarks.quality.cell import reconstruction, run_cell, write_contacts, write_sheet
-from benchmarks.quality.deblur import RivalRow
 from benchmarks.rows import Table, facts
 from benchmarks.study import Cell, Study, begin
 from hqgs.scene.scene import Scene
 
-PROTOCOLS = read_protocols(Path(__file__).parent / "protocols.toml", RivalRow)
+PROTOCOLS = read_protocols(Path(__file__).parent / "protocols.toml")
 ALSO = {"ssim": ("SSIM", ".3f"), "fall": ("below its best (dB)", ".2f")}
 POSES = "poses.csv"  # what `--sfm` found
 
@@ -43,19 +42,6 @@ class Quality:
         known = (table.find(line) or {}).get("search_cpu_s")
         seconds = {"search_cpu_s": self.study.search_cpu_s or known}
         table.put([line | reconstruction(photos.sfm) | seconds | facts()])
-
-    def find_poses(self) -> list[str]:
-        """The lines of `note`, without training; which photos have no poses."""
-        lost = []
-        for cell in {cell.group: cell for cell in self.study.cells}.values():
-            try:
-                photos = self.study.photos(cell)
-            except ValueError as error:
-                lost.append(f"{cell.scene.name}, {cell.degradation}: {error}")
-                continue
-            self.note(cell, photos)
-            self.study.say(f"{cell.scene.name}, {cell.degradation}: {photos.sfm}")
-        return lost
 
     def render(self, cell: Cell, number: int) -> Path:
         return self.study.beside(cell, f"{number}.png")
@@ -113,23 +99,18 @@ def run(args: argparse.Namespace) -> list[str]:
     """Run and compare what was asked for."""
     if args.pictures < 0:
         raise ValueError(f"pictures is {args.pictures}, wanted at least 0")
-    args.sfm = args.sfm or args.poses_only
     quality = Quality(begin(args, PROTOCOLS))
-    if args.poses_only:
-        return quality.find_poses()
     quality.study.train(quality.measure)
     return [*quality.tables(), *quality.sheets(), *quality.study.missing()]
 
 
 FIT = "measure a second time with each held-out camera fitted to the trained scene, as --sfm does"
 SFM = "poses and points from the degraded photos, the same for all rows"
-ALONE = "poses and points from the degraded photos against the scenes' own, without training"
 PICTURES = "sheets per scene and degradation, and a small one of some of them"
 OPTIONS: dict[str, dict[str, Any]] = {
     "--degradations": {"nargs": "+", "metavar": "KIND", "help": "instead of the protocol's"},
     "--validate": {"action": "store_true", "help": "for tuning: judge on training photos, not on test views"},
     "--sfm": {"action": "store_true", "help": SFM},
-    "--poses-only": {"action": "store_true", "help": ALONE},
     "--fit-cameras": {"action": "store_true", "help": FIT},
     "--pictures": {"type": int, "default": 1, "metavar": "N", "help": PICTURES},
 }

@@ -1,9 +1,9 @@
-"""Which rays make up a photo: still, along a camera's path, or through a lens."""
+"""Which rays make up a photo: along a camera's path, or through a lens."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,54 +17,25 @@ from hqgs.scene.scene import Camera
 Floats = NDArray[np.float64]
 
 
-class Device(Protocol):
-    """What a camera does to all its photos."""
-
-    def shade(self, camera: Camera) -> Floats:
-        """What arrives of the light at each pixel, [H, W]."""
-        ...
-
-    def respond(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Values [..., 3] of 0..1 as this camera writes them."""
-        ...
-
-
 class Exposure(NamedTuple):
-    """A photo as the mean of samples, each through a camera of its own, or all through one: sample s of a
-    pixel is the ray of `cameras[s]` through the pixel's corner + `jitter[s]`."""
+    """A photo as the mean of samples: the ray of `cameras[s]` through each pixel's corner + `jitter[s]`."""
 
-    cameras: Sequence[Camera]  # 1 or S
+    cameras: Sequence[Camera]  # S
     jitter: Floats  # [S, 2], x and y in the unit square
 
 
-def render_exposure(
-    exposure: Exposure, gains: Floats | None = None, threads: int | None = None, device: Device | None = None
-) -> NDArray[np.uint8]:
+def render_exposure(exposure: Exposure, threads: int | None = None) -> NDArray[np.uint8]:
     """Photo of the embedded scene, [H, W, 3] sRGB: the mean of an exposure's samples in linear light.
 
-    `gains` [3] of red, green and blue are applied to the light, before the camera's curve, which is the same
-    in all photos: it rolls off the highlights and encodes sRGB. `device`: whose lens darkens the light, and
-    whose response follows the curve. `threads` as in `render_view`.
+    The camera's curve comes last: it rolls off the highlights and encodes sRGB. `threads` as in
+    `render_view`.
     """
-    first, *others = exposure.cameras
-    if others:
-        light = np.zeros((first.height, first.width, 3), np.float32)
-        for camera, offset in zip(exposure.cameras, exposure.jitter, strict=True):
-            light += render_light(camera, offset[None], threads)
-        light /= np.float32(len(exposure.jitter))
-    else:
-        light = render_light(first, exposure.jitter, threads)
-    if gains is not None:
-        light *= gains.astype(np.float32)
-    if device is not None:
-        light = light * device.shade(first).astype(np.float32)[..., None]
-    values = encode(light)
-    return to_bytes(values if device is None else device.respond(values))
-
-
-def still(camera: Camera, jitter: Floats) -> Exposure:
-    """A photo in an instant through a pinhole."""
-    return Exposure([camera], jitter)
+    first = exposure.cameras[0]
+    light = np.zeros((first.height, first.width, 3), np.float32)
+    for camera, offset in zip(exposure.cameras, exposure.jitter, strict=True):
+        light += render_light(camera, offset[None], threads)
+    light /= np.float32(len(exposure.jitter))
+    return to_bytes(encode(light))
 
 
 def shaken(camera: Camera, knots: Floats, count: int) -> Exposure:

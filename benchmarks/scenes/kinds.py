@@ -8,10 +8,10 @@ Importing this module adds them to those that hqgs makes:
 | `exposure[:EV]` | gain and white balance of its own in each photo, in linear light | here |
 | `chat[:SIDE]` | a messenger: shrunk, JPEG, enlarged | here |
 | `phone[:EV]` | a phone in low light: mosaic, noise, its processing, JPEG | `phone.py` |
-| `video[:CRF]`, `video265[:CRF]` | H.264 or H.265 over all photos, sorted by name | `video.py` |
+| `video[:CRF]` | H.264 over all photos, sorted by name | `video.py` |
 
 Without a value, shake takes 12 px for a width of 504 px and scales with it, chat half of the longest side,
-exposure 1, phone 4, videos 36.
+exposure 1, phone 4, video 36.
 
 Records hold of a shake "extent" and "length" of the path in px, and its four knots, "path"; of an exposure
 the "gains" of red, green and blue; of a chat "size" of the
@@ -20,8 +20,7 @@ small photo and "quality"; of a phone "electrons" of white; of a video "frame", 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,10 +102,8 @@ def _phone(image: Float32, stops: float, rng: np.random.Generator) -> tuple[byte
     return phone_jpeg(image, stops, rng), {"electrons": FULL_WELL / 2**stops}
 
 
-def _film(kind: str) -> Callable[[Sequence[Float32], float], list[Own]]:
-    return lambda images, crf: [
-        (frame.image, {"frame": frame.kind, "bytes": frame.bytes}) for frame in film(images, crf, kind)
-    ]
+def _video(images: Sequence[Float32], crf: float) -> list[Own]:
+    return [(frame.image, {"frame": frame.kind, "bytes": frame.bytes}) for frame in film(images, crf)]
 
 
 KINDS |= {
@@ -114,10 +111,9 @@ KINDS |= {
         8, 10000, "the longest side in px", "SIDE", integer=True, at_504=252, formation=False, longest=True
     ),
     "phone": Kind(0, 12, "stops of light that are missing", "EV", default=4, formation=False),
-    "video265": replace(KINDS["video"], formation=False, own=None),
 }
 OPERATORS |= {"shake": _shake, "exposure": _exposure, "chat": _chat}
 FILES |= {"phone": _phone}
-FILMS |= {kind: _film(kind) for kind in ("video", "video265")}
+FILMS["video"] = _video
 for made in ("shake", "exposure", "video"):
     NOT_MADE.pop(made, None)

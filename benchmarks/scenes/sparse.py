@@ -20,19 +20,11 @@ SIDEWAYS, NEARER, HIGHER = math.radians(8), 0.75, 0.45  # past the arc's ends; o
 BEYOND = 6  # held-out cameras, two of each of these
 
 
-def sparse_room(cache: Path | None = None, width: int = WIDTH, height: int = HEIGHT) -> Scene:
-    """The room by 25 cameras on an arc of 130 degrees around its table; every 8th is a test view.
-
-    Neighbours stand 5 degrees apart, in turns low and high, so that two of one height are 10 degrees apart;
-    each sees the table from about 2.8. The rest is as in `embedded_scene`, errors included.
-    """
-    return assemble("sparse", sparse_cameras(width, height), cache, {"cameras": "sparse"})
-
-
 def sparse_cameras(
     width: int = WIDTH, height: int = HEIGHT, num_views: int = 25, seed: int = 2026
 ) -> list[Camera]:
-    """Cameras on the arc, from the left to the right, in turns high and low."""
+    """Cameras on an arc of 130 degrees around the room's table, from the left to the right, in turns high and
+    low, so that two of one height are 10 degrees apart; each sees the table from about 2.8."""
     rng = np.random.default_rng(seed)
     angles = [ARC * ((2 * k + 1) / num_views - 1) for k in range(num_views)]
     return [
@@ -60,7 +52,7 @@ def camera_on_arc(
 def beyond_room(
     photos: int = PHOTOS, cache: Path | None = None, width: int = WIDTH, height: int = HEIGHT
 ) -> Scene:
-    """The room by `photos` cameras on the arc of `sparse_room`, all of which are trained on.
+    """The room by `photos` cameras of `sparse_cameras`, all of which are trained on.
 
     Test views are ray-cast from cameras of their own: 8 called "between", 6 called "beyond" (past the ends
     of the arc, nearer, higher). ValueError for fewer than 2 photos or a size below 1 x 1.

@@ -1,4 +1,4 @@
-"""Photos as a film: through a real H.264 or H.265 encoder and back."""
+"""Photos as a film: through a real H.264 encoder and back."""
 
 from __future__ import annotations
 
@@ -14,14 +14,9 @@ from scipy.ndimage import zoom
 from hqgs.photos.pixels import Float32, as_floats, to_uint8
 from hqgs.photos.video import FPS, pyav
 
+ENCODER, DECODER = "libx264", "h264"
 # The vector code of x264 gives other bits from call to call; without it a film takes 2.5 times as long.
-_X264 = {"x264-params": "asm=0"}
-_X265 = {"x265-params": "pools=none:frame-threads=1:wpp=0:info=0:log-level=none"}
-# Encoder, decoder, and options of the encoder for the same bits at any number of cores.
-CODECS: dict[str, tuple[str, str, dict[str, str]]] = {
-    "video": ("libx264", "h264", _X264),
-    "video265": ("libx265", "hevc", _X265),
-}
+OPTIONS = {"x264-params": "asm=0", "preset": "medium"}
 # Luma and chroma of 8 bits, ITU-R BT.601 with limited range: Y in 16..235, Cb and Cr in 16..240.
 _TO_YUV = np.array(
     [
@@ -43,31 +38,30 @@ class FilmFrame:
     bytes: int  # of the compressed frame, in the first one with the headers
 
 
-def film(images: Sequence[Float32], value: float, kind: str = "video") -> list[FilmFrame]:
+def film(images: Sequence[Float32], value: float) -> list[FilmFrame]:
     """Encode photos [H, W, 3] of one size, clipped and rounded to 8 bits, as one film, and decode it.
 
-    x264 (`video`) or x265 (`video265`) at a constant rate factor; preset medium, 30 frames per second, on one
-    thread; otherwise the encoder's own defaults. Photos are BT.601 with limited range and 4:2:0 chroma, the
-    mean of each 2 x 2 pixels; the way back interpolates the chroma bilinearly. Odd sides get their last row
-    or column once more, which is cut off again. The same photos give the same bits with the same build of
-    PyAV. ValueError without PyAV (the extra `video`) or its encoder, or for photos of several sizes.
+    x264 at a constant rate factor; preset medium, 30 frames per second, on one thread; otherwise the
+    encoder's own defaults. Photos are BT.601 with limited range and 4:2:0 chroma, the mean of each 2 x 2
+    pixels; the way back interpolates the chroma bilinearly. Odd sides get their last row or column once more,
+    which is cut off again. The same photos give the same bits with the same build of PyAV. ValueError without
+    PyAV (the extra `video`) or its encoder, or for photos of several sizes.
     """
     av = pyav("video")
     sizes = sorted({image.shape[1::-1] for image in images})
     if len(sizes) > 1:
         each = " and ".join(f"{w} x {h}" for w, h in sizes[:2])
         raise ValueError(f"a film has frames of one size, but there are photos of {each} px")
-    encoder, decoder, options = CODECS[kind]
     (width, height), (odd_columns, odd_rows) = sizes[0], (side % 2 for side in sizes[0])
     try:
-        out = av.CodecContext.create(encoder, "w")
+        out = av.CodecContext.create(ENCODER, "w")
     except (ValueError, av.error.FFmpegError) as error:  # a PyAV that was built without the encoder
-        raise ValueError(f"{kind} needs PyAV with the encoder {encoder}: {error}") from error
+        raise ValueError(f"video needs PyAV with the encoder {ENCODER}: {error}") from error
     out.width, out.height, out.pix_fmt = width + odd_columns, height + odd_rows, "yuv420p"
     out.time_base, out.framerate = Fraction(1, FPS), Fraction(FPS)
     out.thread_count = 1
-    out.options = {"crf": str(value), "preset": "medium", **options}
-    back = av.CodecContext.create(decoder, "r")
+    out.options = {"crf": str(value), **OPTIONS}
+    back = av.CodecContext.create(DECODER, "r")
     back.thread_count = 1
 
     sizes_by_time: dict[int, int] = {}
@@ -90,9 +84,7 @@ def film(images: Sequence[Float32], value: float, kind: str = "video") -> list[F
             decode(packet)
         decode(None)
     except av.error.FFmpegError as error:
-        raise ValueError(
-            f"{kind}:{value:g} of photos of {width} x {height} px: {encoder}: {error}"
-        ) from error
+        raise ValueError(f"video:{value:g} of photos of {width} x {height} px: {ENCODER}: {error}") from error
     return [
         FilmFrame(
             as_floats(_from_planes(planes, out.width)[:height, :width]), frame_kind, sizes_by_time[time]

@@ -11,11 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.scenes.devices import Device, draw_devices
-from benchmarks.scenes.exposure import Exposure, render_exposure, shaken, still, through_lens
-from benchmarks.scenes.kinds import draw_gains
+from benchmarks.scenes.exposure import render_exposure, shaken, through_lens
 from benchmarks.scenes.room.scene import FOCUS, HEIGHT, WIDTH, embedded_scene, keep, kept
-from benchmarks.scenes.room.shading import sample_pattern
 from benchmarks.scenes.shake import draw_path, draw_strength, knots_mean, path_extent, path_length
 from hqgs.photos.formula import Kind
 from hqgs.scene.scene import Camera, Scene
@@ -25,16 +22,12 @@ Floats = NDArray[np.float64]
 TRUE_KINDS = {
     "true-shake": Kind(0.5, 100, "the longest extent of a shake in px", at_504=12.0),
     "true-defocus": Kind(0.5, 20, "the largest radius in px of a point at infinity", at_504=4.0),
-    "true-exposure": Kind(0.01, 4, "the most stops to either side", default=1),
-    "true-devices": Kind(2, 12, "cameras that took turns", integer=True, default=4),
 }
 DISTANCE = FOCUS[2]  # at which translations and lenses have the stated effect, world units
 TURNS, MOVES = 0.75, 0.25  # shares of a path's extent: turns up, down and sideways; each other freedom
 NEAREST, FARTHEST = 2.5, 8.0  # between which photos are focused, world units
-DEVICE_STOPS = 0.5  # to either side, of the gains of photos by several cameras
 SHAKE_SAMPLES = (12, 96)  # at least and at most, rays a pixel
 LENS_SAMPLES = (16, 64)
-STILL = sample_pattern(3)  # as clean photos have it
 
 
 class PhotoTruth(NamedTuple):
@@ -47,9 +40,7 @@ class PhotoTruth(NamedTuple):
     path: Floats = np.zeros((4, 6))  # knots as `path_viewmats` takes them
     aperture: float = 0.0  # radius of the lens, world units
     focus: float = math.inf  # depth in focus, world units
-    gains: Floats = np.ones(3)  # of red, green and blue, in linear light
-    device: Device | None = None
-    samples: int = len(STILL)  # rays a pixel
+    samples: int = 1  # rays a pixel
 
     def record(self, kind: str) -> dict[str, Any]:
         """The same as JSON values, without what is neutral."""
@@ -58,10 +49,6 @@ class PhotoTruth(NamedTuple):
             facts |= {"extent": self.extent, "path": self.path.tolist()}
         if self.aperture:
             facts |= {"aperture": self.aperture, "focus": self.focus}
-        if (self.gains != 1).any():
-            facts["gains"] = self.gains.tolist()
-        if self.device is not None:
-            facts["device"] = self.device.record()
         return facts
 
 
@@ -93,11 +80,6 @@ def wild_room(
     - `true-defocus[:R]` (4): a thin lens. Its radius makes a point at infinity a disc of radius r px when it
       is focused at DISTANCE, r uniform in [0.2, 1] R; the focus of each photo is uniform in 1/z between
       depths of 2.5 and 8.
-    - `true-exposure[:EV]` (1): gains as in `exposure` (`draw_gains`), on the light before the camera's curve.
-    - `true-devices[:N]` (4): N cameras take turns, each with corners that its lens darkens and a response of
-      its own (`draw_devices`), each photo with gains as `true-exposure:0.5`. The means of the responses, and
-      of the logarithm of what gains and lenses make of light, are 0, as no photo can tell them. Views tell
-      which camera took them (`View.device`).
 
     All is averaged in linear light; the camera's curve (`render_exposure`) comes last, then 8 bits. Each
     photo has a generator of its own from the seed and its place among all names. Points and poses are those
@@ -113,9 +95,6 @@ def wild_room(
         view.name: _draw(name, value, view.camera, np.random.default_rng([seed, names.index(view.name)]))
         for view in clean.train
     }
-    if name == "true-devices":
-        rng = np.random.default_rng([seed, len(names)])
-        truth = _of_devices(truth, rng, int(value), clean.train[0].camera)
     made = {"kind": name, "value": value, "seed": seed, "size": [width, height], "num_views": num_views}
     photos = kept_photos(
         None if cache is None else cache / f"{name}_{value:g}_{seed}.npz",
@@ -126,11 +105,7 @@ def wild_room(
         f"photographed with {name}:{value:g}, seed {seed}: all training photos ({len(clean.train)}), "
         f"ray-cast in linear light; held-out photos ({len(clean.test)}) are clean; points and poses are exact"
     )
-    train = [
-        replace(view, image=photos[view.name], device=device.name if device is not None else "")
-        for view in clean.train
-        for device in [truth[view.name].device]
-    ]
+    train = [replace(view, image=photos[view.name]) for view in clean.train]
     return WildRoom(replace(clean, train=train, notes=[*clean.notes, note]), clean, truth)
 
 
@@ -154,48 +129,24 @@ def parse_true_kind(text: str, width: int = WIDTH) -> tuple[str, float]:
         raise ValueError(f"unknown kind {text!r}; the room has: {', '.join(TRUE_KINDS)}")
     kind = TRUE_KINDS[name]
     if not colon:
-        return name, (kind.at_504 or 0) * width / WIDTH if kind.default is None else kind.default
+        return name, (kind.at_504 or 0) * width / WIDTH
     try:
         value = float(number)
     except ValueError:
         value = math.nan
-    if not kind.lowest <= value <= kind.highest or (kind.integer and value % 1):
+    if not kind.lowest <= value <= kind.highest:
         raise ValueError(f"{name} is {number}, wanted {kind.unit}, {kind.lowest:g}..{kind.highest:g}")
     return name, value
 
 
-def exposure(kind: str, camera: Camera, truth: PhotoTruth) -> Exposure:
-    """The exposure that the truth of a photo stands for."""
-    if kind == "true-shake":
-        return shaken(camera, truth.path, truth.samples)
-    if kind == "true-defocus":
-        return through_lens(camera, truth.aperture, truth.focus, truth.samples)
-    return still(camera, STILL)
-
-
 def taken(kind: str, camera: Camera, truth: PhotoTruth) -> NDArray[np.uint8]:
     """The photo that the truth stands for."""
-    return render_exposure(exposure(kind, camera, truth), truth.gains, device=truth.device)
-
-
-def _of_devices(
-    truth: dict[str, PhotoTruth], rng: np.random.Generator, count: int, camera: Camera
-) -> dict[str, PhotoTruth]:
-    """The same photos by so many cameras; gains and lenses together leave the mean of log light as it is."""
-    devices = draw_devices(rng, len(truth), count)
-    mean = np.log([photo.gains for photo in truth.values()]).mean(0)
-    mean += np.mean([np.log(device.shade(camera)).mean() for device in devices])
-    return {
-        name: photo._replace(gains=photo.gains / np.exp(mean), device=device)
-        for (name, photo), device in zip(truth.items(), devices, strict=True)
-    }
+    if kind == "true-shake":
+        return render_exposure(shaken(camera, truth.path, truth.samples))
+    return render_exposure(through_lens(camera, truth.aperture, truth.focus, truth.samples))
 
 
 def _draw(kind: str, value: float, camera: Camera, rng: np.random.Generator) -> PhotoTruth:
-    if kind == "true-exposure":
-        return PhotoTruth(gains=draw_gains(rng, value))
-    if kind == "true-devices":
-        return PhotoTruth(gains=draw_gains(rng, DEVICE_STOPS))
     strength, focal = value * draw_strength(rng), camera.K[0, 0]
     if kind == "true-defocus":
         aperture = strength * DISTANCE / focal
