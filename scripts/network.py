@@ -33,7 +33,7 @@ import hqgs
 from hqgs.base.files import CHECKPOINT, PLY, write_json
 from hqgs.base.ranks import joined
 from hqgs.pipeline import open_run
-from hqgs.training.config import run_config
+from hqgs.training.config import TrainOptions, decided
 
 ROOT = Path(__file__).resolve().parents[1]
 PORT = 29500
@@ -76,7 +76,7 @@ def digest(run: Path) -> str:
 
 def trained(args: argparse.Namespace, ranks: Any, out: Path) -> list[dict[str, Any]]:
     """Train, and save the scene; a record of each step."""
-    config = run_config(
+    asked = TrainOptions(
         iterations=args.iterations,
         batch=args.batch,
         method="hqgs",
@@ -84,6 +84,7 @@ def trained(args: argparse.Namespace, ranks: Any, out: Path) -> list[dict[str, A
         max_gaussians=args.gaussians,
         eval_every=10**9,
     )
+    config = decided(asked.said())
     hqgs.set_num_threads(1)
     records: list[dict[str, Any]] = []
     with open_run(hqgs.load(args.scene), config, ranks=ranks) as trainer:

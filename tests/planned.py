@@ -5,16 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from tiny_scene import tiny_scene
 
 from hqgs.scene.scene import View
-from hqgs.training.config import TrainConfig, decided, merged
+from hqgs.training.config import TrainConfig, TrainOptions, decided, merged
 from hqgs.training.plan import RunPlan
 from hqgs.training.prepare import facts_of
 from hqgs.training.rules import plan_run
 from hqgs.training.schedule import Schedule
 from hqgs.training.settings import read_plan, said_by
+
+
+def run_config(**said: Any) -> TrainConfig:
+    """The configuration of a run of these options."""
+    return decided(TrainOptions(**said).said())
 
 
 def planned(config: TrainConfig, views: Sequence[View], as_photographed: bool = True) -> RunPlan:

@@ -31,6 +31,7 @@ ROOT = Path(__file__).parents[1]
 if __name__ == "__main__":
     sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
+from planned import run_config  # noqa: E402
 from test_learned_cameras import textured_scene, with_gains  # noqa: E402
 from tiny_scene import tiny_config, tiny_scene  # noqa: E402
 
@@ -41,7 +42,7 @@ from hqgs.photos.formula import parse_degradation  # noqa: E402
 from hqgs.pipeline import open_run  # noqa: E402
 from hqgs.scene.degrade import degrade_scene  # noqa: E402
 from hqgs.scene.scene import Scene  # noqa: E402
-from hqgs.training.config import HQGSConfig, TrainConfig, run_config  # noqa: E402
+from hqgs.training.config import HQGSConfig, TrainConfig  # noqa: E402
 from hqgs.training.trainer import Trainer  # noqa: E402
 
 RECORD = Path(__file__).with_suffix(".json")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from planned import run_config
 from tiny_scene import DEPTH, tiny_config, tiny_scene
 
 import hqgs
@@ -22,7 +23,7 @@ from hqgs.cli import main as cli
 from hqgs.evaluation.records import read_report
 from hqgs.scene import source
 from hqgs.scene.options import LoadOptions
-from hqgs.training.config import AUTOMATIC, PART, TrainConfig, TrainOptions, run_config
+from hqgs.training.config import AUTOMATIC, PART, TrainConfig, TrainOptions
 from hqgs.training.prepare import facts_of
 from hqgs.training.rules import plan_run
 

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from planned import run_config
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.training.config import TrainConfig, run_config
+from hqgs.training.config import TrainConfig
 from hqgs.training.plan import Facts
 from hqgs.training.rules import plan_run
 from hqgs.training.state import Average

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from planned import run_config
 from run_state import assert_stopped_alike
 from tiny_scene import tiny_config, tiny_scene
 
@@ -16,7 +17,7 @@ from hqgs.base.files import CHECKPOINT
 from hqgs.pipeline import open_run, train
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import OTHER, check_scene, load_checkpoint, save_checkpoint, scene_fingerprint
-from hqgs.training.config import DensifyConfig, run_config
+from hqgs.training.config import DensifyConfig
 from hqgs.training.trainer import Trainer, fit_to_seconds
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from fixtures_scenes import make_truth, write_transforms
 from PIL import Image
+from planned import run_config
 from tiny_scene import tiny_scene
 
 import hqgs
@@ -28,7 +29,6 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, SfmReport
-from hqgs.training.config import run_config
 from hqgs.training.length import seconds_left
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.plan import RunPlan

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from planned import planned, repeated
+from planned import planned, repeated, run_config
 from run_state import assert_same, whole_state
 from test_diagnose import inspected
 from test_learned_cameras import textured_scene
@@ -20,7 +20,7 @@ from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import rules
-from hqgs.training.config import DensifyConfig, TrainConfig, run_config, with_iterations
+from hqgs.training.config import DensifyConfig, TrainConfig, with_iterations
 from hqgs.training.length import by_the_clock
 from hqgs.training.notes import run_notes
 from hqgs.training.plan import StepSeconds

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from planned import run_config
 from run_state import assert_stopped_alike, run_until
 from tiny_scene import tiny_config, tiny_scene
 
@@ -23,7 +24,7 @@ from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.scene.geometry import project
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.training.config import HQGSConfig, run_config
+from hqgs.training.config import HQGSConfig
 from hqgs.training.methods.cameras import LearnedCameras, take_photo
 from hqgs.training.trainer import Trainer
 

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from planned import run_config
 from run_state import run_until
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.model.gaussians import Gaussians
-from hqgs.training.config import TrainConfig, run_config
+from hqgs.training.config import TrainConfig
 from hqgs.training.methods.base import Method
 from hqgs.training.overfitting import DROPPED, OPAQUE, decay_opacities, with_dropout
 from hqgs.training.plan import Facts

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from planned import planned, repeated
+from planned import planned, repeated, run_config
 from run_state import run_until
 from test_diagnose import degraded_scene
 from test_learned_cameras import textured_scene
@@ -23,7 +23,7 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.pipeline import open_run
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import rules
-from hqgs.training.config import PRESETS, HQGSConfig, run_config, with_iterations
+from hqgs.training.config import PRESETS, HQGSConfig, with_iterations
 from hqgs.training.plan import RunPlan, StepSeconds
 from hqgs.training.prepare import Prepared, facts_of
 from hqgs.training.rules import PIXELS, RULES, Draft, Rule, first_points_wanted, plan_run

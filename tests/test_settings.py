@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from planned import run_config
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.base.files import CHECKPOINT, CONFIG
 from hqgs.cli.main import COMMANDS, main
 from hqgs.cli.train import Train, asked_for, loading, read
-from hqgs.evaluation.run_folder import RunFolder
 from hqgs.evaluation.verdict import verdict
 from hqgs.pipeline import train
 from hqgs.scene.options import LoadOptions
-from hqgs.training.config import PRESETS, TrainConfig, decided, merged, run_config, with_iterations
+from hqgs.training.config import PRESETS, TrainConfig, decided, with_iterations
 from hqgs.training.settings import config_values, read_said, said_by
 
 
@@ -35,32 +35,11 @@ def read_config(path: Path) -> TrainConfig:
 
 def test_a_configuration_comes_back_from_its_file(tmp_path: Path) -> None:
     config = replace(run_config(iterations=700, seed=3, formation="blur:2"), background=(0.0, 0.5, 1.0))
-    for values in (config_values(config), {"train": config_values(config), "scene": None}):
-        (tmp_path / "config.json").write_text(json.dumps(values))
-        assert read_config(tmp_path / "config.json") == read_config(tmp_path) == config
+    (tmp_path / CONFIG).write_text(json.dumps(config_values(config)))
+    assert config_values(read_config(tmp_path / CONFIG)) == config_values(config)
     for own in (config, tiny_config(), TrainConfig()):
-        (tmp_path / "config.json").write_text(json.dumps({"said": said_by(own), "train": {"seed": 99}}))
+        (tmp_path / CONFIG).write_text(json.dumps({"said": said_by(own), "train": {"seed": 99}}))
         assert read_config(tmp_path) == own
-
-
-def test_configurations_of_a_former_version_are_read(tmp_path: Path) -> None:
-    """As commit 4e73c6f wrote them, of runs with --config.densify.every 9, and with --seconds 2: what it
-    wrote of what nobody had said does not count as said."""
-    files = json.loads((Path(__file__).parent / "former_configs.json").read_text())
-    for name, values in files.items():
-        (tmp_path / f"{name}.json").write_text(json.dumps(values))
-    said = read_said(tmp_path / "of a length.json")
-    wanted = run_config(iterations=60, method="3dgs", leave_out="photos,growth", max_gaussians=30_000)
-    wanted = replace(wanted, densify=replace(wanted.densify, every=9))
-    assert decided(said) == wanted
-    assert decided(merged(said, {"iterations": 900})) == replace(wanted, iterations=900)
-    assert config_values(decided(said))["densify"] == files["of a length"]["train"]["densify"]
-    assert read_config(tmp_path / "of seconds.json") == run_config(seconds=2.0)
-    longer = options("--config", tmp_path / "of seconds.json", "--iterations", "900")
-    assert config_of(longer) == run_config(iterations=900)
-    (tmp_path / CONFIG).write_text(json.dumps(files["of a length"]))
-    assert RunFolder(tmp_path).loaded["longest"] == 480
-    assert LoadOptions(**RunFolder(tmp_path).loaded).test_every == 8
 
 
 @pytest.mark.parametrize(
@@ -73,6 +52,7 @@ def test_configurations_of_a_former_version_are_read(tmp_path: Path) -> None:
         ({"densify": 3}, "wanted an object with fields, got 3"),
         ({"method": "4dgs"}, "unknown method '4dgs'"),
         ([], r"wanted an object with fields, got \[\]"),
+        ({"train": {"iterations": 3}, "scene": None}, "of an older version of hqgs"),
     ],
 )
 def test_a_bad_file_is_told_by_field(values: Any, message: str, tmp_path: Path) -> None:
@@ -107,7 +87,7 @@ def test_options_of_the_configuration_go_over_what_the_others_come_to(tmp_path: 
     assert config_of(quick) == run_config(iterations=PRESETS["quick"].iterations)
     assert config_of(options("--preset", "quick", "--iterations", "50")) == run_config(iterations=50)
     file = tmp_path / "mine.json"
-    file.write_text(json.dumps(config_values(wanted)))
+    file.write_text(json.dumps(said_by(wanted)))
     assert config_of(options("--config", file)) == wanted
     assert config_of(options("--config", file, "--iterations", "900")) == run_config(iterations=900, seed=5)
     assert config_of(options("--config", file, "--leave-out", "none")) == replace(wanted, leave_out=())
@@ -134,7 +114,8 @@ def test_the_most_that_a_run_might_have_had_can_be_asked_for(tmp_path: Path, sec
     """config.json has that number although nobody asked for it."""
     file, wanted = tmp_path / CONFIG, run_config(iterations=TrainConfig.iterations)
     open_ended = replace(run_config(), seconds=seconds)
-    file.write_text(json.dumps({"train": config_values(open_ended)}))
+    said = {} if seconds is None else {"seconds": seconds}
+    file.write_text(json.dumps({"said": said, "train": config_values(open_ended)}))
     assert config_of(options("--config", file, "--iterations", str(wanted.iterations))) == wanted
     (tmp_path / CHECKPOINT).touch()
     resumed = Train(scene="photos", out=tmp_path, resume=True, iterations=wanted.iterations)
@@ -142,12 +123,13 @@ def test_the_most_that_a_run_might_have_had_can_be_asked_for(tmp_path: Path, sec
     assert config_of(replace(resumed, iterations=None)).seconds == seconds
 
 
-@pytest.mark.parametrize("before", [run_config(), run_config(iterations=600), run_config(leave_out="none")])
-def test_what_is_said_again_changes_nothing(tmp_path: Path, before: TrainConfig) -> None:
+@pytest.mark.parametrize("said", [{}, {"iterations": 600}, {"leave_out": "none"}])
+def test_what_is_said_again_changes_nothing(tmp_path: Path, said: dict[str, Any]) -> None:
     """On resume, and with the configuration of another run; only what differs is asked anew."""
-    file = tmp_path / CONFIG
+    file, before = tmp_path / CONFIG, run_config(**said)
     loaded = LoadOptions(path="photos", test_every=5, longest=480)
-    file.write_text(json.dumps({"train": config_values(before), "scene": asdict(loaded)}))
+    kept = {"said": said, "train": config_values(before), "scene": asdict(loaded)}
+    file.write_text(json.dumps(kept))
     (tmp_path / CHECKPOINT).touch()
     same = ["--method", "auto", "--seed", "0", "--batch", "1"]
     same += ["--leave-out", "auto"] if before.leave_out else ["--leave-out", "none"]

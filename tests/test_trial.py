@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from planned import run_config
 from run_state import run_until
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
@@ -22,7 +23,7 @@ from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.scene.scene import Scene
 from hqgs.training import prepare, trial
-from hqgs.training.config import TrainConfig, run_config
+from hqgs.training.config import TrainConfig
 from hqgs.training.plan import Facts, RunPlan, StepSeconds, Tried
 from hqgs.training.rules import no_growth, plan_run
 from hqgs.training.trainer import Trainer

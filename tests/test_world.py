@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from fixtures_scenes import Truth, make_truth, photographed, write_colmap, write_transforms
+from planned import run_config
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
@@ -25,7 +26,6 @@ from hqgs.scene.degrade import write_degraded_scene
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.world import World
-from hqgs.training.config import run_config
 from hqgs.training.frame import Frame
 
 UTM = np.array([500000.0, 5200000.0, 300.0])

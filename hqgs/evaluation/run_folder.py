@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,9 +22,6 @@ if TYPE_CHECKING:
 
     from hqgs.scene.camera_files import RunCameras
     from hqgs.scene.scene import Camera, Scene
-
-
-LEFT = {"features", "tag_size"}  # options of older versions
 
 
 @dataclass(frozen=True)
@@ -59,8 +55,8 @@ class RunFolder:
     @property
     def loaded(self) -> dict[str, Any]:
         """What `hqgs.load` was asked for; empty where nothing tells, as of a scene made in Python."""
-        told = self._part("scene")
-        return {name: value for name, value in told.items() if name not in LEFT}
+        known = {option.name for option in fields(LoadOptions)}
+        return {name: value for name, value in self._part("scene").items() if name in known}
 
     @cached_property
     def cameras(self) -> RunCameras | None:
@@ -184,17 +180,14 @@ def moved_px(scene: Scene, known: RunCameras) -> float | None:
     off = list[float]()
     for one in known.views:
         if (view := views.get(one.name)) is not None:
-            # Runs of old have cameras as photos are stored.
-            both = [
-                scene.world.viewmat_to(known.world, c.viewmat) for c in (view.upright_camera, view.camera)
-            ]
-            off.append(_least_off(one.camera, both, points))
+            there = scene.world.viewmat_to(known.world, view.upright_camera.viewmat)
+            off.append(_off(one.camera, there, points))
     return float(np.median(off)) if off else None
 
 
-def _least_off(camera: Camera, viewmats: Sequence[np.ndarray], points: np.ndarray) -> float:
+def _off(camera: Camera, viewmat: np.ndarray, points: np.ndarray) -> float:
     """Px between where a camera and one at another pose show points of a grid across its picture, at the
-    median depth of `points` [P, 3] before it: the mean; the least of several poses."""
+    median depth of `points` [P, 3] before it: the mean."""
     import numpy as np
 
     depths = points @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
@@ -203,9 +196,6 @@ def _least_off(camera: Camera, viewmats: Sequence[np.ndarray], points: np.ndarra
     pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
     seen = np.vstack([depth * np.linalg.solve(camera.K, pixels), np.ones(x.size)])
     shown = np.linalg.solve(camera.viewmat, seen)
-    off = list[float]()
-    for viewmat in viewmats:
-        there = camera.K @ (viewmat @ shown)[:3]
-        apart = np.linalg.norm(there[:2] / np.maximum(there[2], 1e-9 * depth) - pixels[:2], axis=0)
-        off.append(float(np.minimum(apart, camera.width).mean()))
-    return min(off)
+    there = camera.K @ (viewmat @ shown)[:3]
+    apart = np.linalg.norm(there[:2] / np.maximum(there[2], 1e-9 * depth) - pixels[:2], axis=0)
+    return float(np.minimum(apart, camera.width).mean())

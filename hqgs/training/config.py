@@ -164,10 +164,7 @@ class Due(NamedTuple):
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything but the photos that a result depends on. None: not said, so that the plan decides.
-
-    `run_config` makes the configuration of a run as a user asks for it.
-    """
+    """Everything but the photos that a result depends on. None: not said, so that the plan decides."""
 
     iterations: int = 30_000  # training views seen
     method: str = AUTO  # one of METHODS
@@ -295,11 +292,6 @@ class TrainOptions:
                 part = PART.get(option.name)
                 (found if part is None else found.setdefault(part, {}))[option.name] = value
         return found
-
-
-def run_config(**said: Any) -> TrainConfig:
-    """The configuration of a run of these `TrainOptions`."""
-    return decided(TrainOptions(**said).said())
 
 
 def merged(before: Said, now: Said) -> Said:

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hqgs.base.files import CHECKPOINT, CONFIG, PLAN, read_json
-from hqgs.training.config import AUTO, AUTOMATIC, Said, TrainConfig, decided, merged
-
-LEFT = {"passersby", "weight"}  # items of former versions, which configurations may still name
+from hqgs.training.config import Said, TrainConfig, decided, merged
 
 
 def config_values(config: TrainConfig) -> dict[str, Any]:
@@ -27,7 +25,7 @@ def said_by(config: TrainConfig) -> Said:
 
 
 def read_said(path: str | Path) -> Said:
-    """What a file says: config.json of a run, of a former version too, or some fields of `TrainConfig`.
+    """What a file says: config.json of a run, or some fields of `TrainConfig`.
 
     FileNotFoundError, or ValueError that names the field.
     """
@@ -37,33 +35,10 @@ def read_said(path: str | Path) -> Said:
     values = read_json(path)
     if not isinstance(values, dict):
         raise ValueError(f"{path}: wanted an object with fields, got {values!r:.60}")
-    said, train = (values.get(name) for name in ("said", "train"))
-    if not isinstance(said, dict):
-        said = _said_once(train if isinstance(train, dict) else values)
+    said = values.get("said", values)
+    if "train" in said:
+        raise ValueError(f"{path} is of an older version of hqgs, which did not tell what was asked for")
     decided(said, str(path))
-    return said
-
-
-def _said_once(values: Said) -> Said:
-    """What was said, as far as these fields tell it, which config.json of former versions has all of.
-
-    What the length decides was not said there, nor was a length beyond which nothing paid.
-    """
-    said = {name: value for name, value in values.items() if value is not None}
-    if isinstance(said.get("hqgs"), dict):
-        said["hqgs"] = {name: value for name, value in said["hqgs"].items() if name != "paper"}
-    length, items = said.get("iterations"), said.get("leave_out")
-    if isinstance(items, list):
-        items = said["leave_out"] = [item for item in items if item not in LEFT]
-        if "iterations" in items and length == TrainConfig.iterations:
-            del said["iterations"]
-            if {*items} == {*AUTOMATIC, "iterations"}:
-                said["leave_out"] = AUTO
-    if type(length) is int and length > 0:
-        for name, value in TrainConfig(iterations=length).due._asdict().items():
-            for part in (said, said.get("densify")):
-                if isinstance(part, dict) and part.get(name) == value:
-                    del part[name]
     return said
 
 
