@@ -43,7 +43,7 @@ from hqgs.training.config import Said, TrainConfig, TrainOptions, decided, merge
 from hqgs.training.frame import Frame
 from hqgs.training.notes import fell_short, learned_record, photo_record, run_notes
 from hqgs.training.plan import essential
-from hqgs.training.progress import OnProgress, progress_of
+from hqgs.training.progress import OnProgress, Progress
 from hqgs.training.settings import config_values, plan_values, resumed, said_by
 from hqgs.training.trainer import Trainer, fit_to_seconds
 
@@ -237,7 +237,21 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
             if evaluate:
                 trainer.evaluate()
             if progress is not None:
-                progress(progress_of(trainer, step, trainer.history[-1] if evaluate else None))
+                progress(
+                    Progress(
+                        iteration=trainer.iteration,
+                        length=trainer.length,
+                        seconds=trainer.seconds,
+                        gaussians=len(trainer.gaussians),
+                        loss=step.loss,
+                        view=step.view.name,
+                        render=step.render.numpy(),
+                        evaluated=trainer.history[-1] if evaluate else None,
+                        diagnosis=trainer.diagnosis,
+                        _step=step,
+                        _trainer=trainer,
+                    )
+                )
             if due(config.due.checkpoint_every):
                 _check_agreement(trainer)
                 if out is not None:
@@ -291,7 +305,7 @@ def _report(
 ) -> Report:
     """The report, written into `out`, if there is one; what made it is in `trainer`."""
     scene = trainer.prepared.given
-    rows = [row.known() for row in trainer.rows]
+    rows = [row.known() for row in (*trainer.plan.rows, *trainer.state.rows)]
     place, sfm, diagnosis = scene.place, scene.sfm, trainer.diagnosis
     learned = [learned_record(found) for found in trainer.method.learned()]
     record: RunRecord = {

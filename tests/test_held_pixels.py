@@ -39,12 +39,12 @@ class Held:
     def __init__(self, given: Photos) -> None:
         drawn = {name: HeldPixels.draw(k, *photo) for k, (name, photo) in enumerate(given.items())}
         self.masks = {name: mask for name, (_, mask) in drawn.items()}
-        self.pixels = {name: held for name, (held, _) in drawn.items()}
+        self.pixels = {name: (k, held) for k, (name, (held, _)) in enumerate(drawn.items())}
         self.plateau = Plateau(len(given))
 
     def see(self, name: str, image: Tensor) -> None:
-        held = self.pixels[name]
-        self.plateau.see(held.photo, held.error(image))
+        k, held = self.pixels[name]
+        self.plateau.see(k, held.error(image))
 
     @property
     def rate_left(self) -> float:

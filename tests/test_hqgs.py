@@ -31,7 +31,7 @@ from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene
 from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig, HQGSConfig
-from hqgs.training.methods import make_method
+from hqgs.training.methods import MAKERS
 from hqgs.training.methods.hqgs import HQGS
 from hqgs.training.methods.paper import PaperHQGS
 from hqgs.training.methods.photometric import photometric_loss
@@ -285,7 +285,7 @@ def test_a_photo_that_does_not_fit_is_named() -> None:
 
 def test_the_papers_guidance_is_another_method() -> None:
     for config, method in ((HQGSConfig(guidance="paper"), PaperHQGS), (fixed("none"), HQGS)):
-        made = make_method(tiny_scene(), tiny_config(method="hqgs", hqgs=config), Inspector())
+        made = MAKERS["hqgs"](tiny_scene(), tiny_config(hqgs=config), Inspector())
         assert type(made) is method
 
 

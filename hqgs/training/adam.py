@@ -16,8 +16,6 @@ from torch.optim.optimizer import ParamsT
 from hqgs import _rust
 from hqgs.model.gaussians import Gaussians
 
-# A loaded state dict may ask for these.
-
 
 class Adam(torch.optim.Optimizer):
     """Adam (Kingma and Ba 2015) as `torch.optim.Adam` with its defaults; state `step, exp_avg, exp_avg_sq`.

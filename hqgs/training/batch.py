@@ -21,7 +21,6 @@ from hqgs.base.ranks import Ranks
 from hqgs.model.gaussians import Gaussians
 from hqgs.training import checkpoint
 from hqgs.training.adam import Adam
-from hqgs.training.densify import gradient_norms
 from hqgs.training.forward import ForwardPass, Gradients, Step, TrainingViews
 from hqgs.training.guard import Fault
 from hqgs.training.schedule import StepPlan
@@ -94,7 +93,11 @@ def gradients_of_several(
     def apply() -> None:
         with torch.no_grad():
             modulated = method.modulate(state.gaussians)
-        descend(parts, state.gaussians, modulated, state.optimizer)
+        state.optimizer.zero_grad()
+        sound = [part for part in parts if part.fault is None]
+        give_harmonics(sound, state.gaussians, modulated)
+        # A step along the mean of the gradients of the parts without a fault, added in their order.
+        state.optimizer.step(views=give_others(sound, state.gaussians, state.optimizer))
         for plan, part in zip(plans, parts, strict=True):
             if plan.observes and part.fault is None:
                 state.densifier.note(part.rows[part.seen].long(), part.values[part.seen, OBSERVED])
@@ -135,7 +138,9 @@ def part_of(forward: ForwardPass, fault: Fault | None, trained: Gaussians, optim
     for gradient in gradients.values():
         shown |= (gradient.reshape(n, -1) != 0).any(dim=1)
     (means2d,), higher = forward.pulls[0], trained.shN.grad
-    norms = torch.where(visible, gradient_norms(means2d, camera.width, camera.height), UNSEEN)
+    # A pixel is 2 / width of normalised device coordinates, in which the threshold of growth is published.
+    pulls = torch.hypot(means2d[:, 0] * (camera.width / 2), means2d[:, 1] * (camera.height / 2))
+    norms = torch.where(visible, pulls, UNSEEN)
     columns = [gradients[name].reshape(n, width) for name, width in WIDTHS.items()]
     own |= {name: param.grad for name, param in _own(optimizer).items() if param.grad is not None}
     return replace(
@@ -159,14 +164,6 @@ def exchanged(ranks: Ranks, count: int, make: Callable[[int], Part]) -> list[Par
         answers.append(ranks.begin(make(k).packed() if k < count else b""))
     ranks.worked += time.perf_counter() - started
     return [Part.unpacked(data) for answer in answers for data in answer() if data]
-
-
-def descend(parts: Sequence[Part], trained: Gaussians, modulated: Gaussians, optimizer: Adam) -> None:
-    """A step of Adam along the mean of the gradients of the parts without a fault, added in their order."""
-    optimizer.zero_grad()
-    sound = [part for part in parts if part.fault is None]
-    give_harmonics(sound, trained, modulated)
-    optimizer.step(views=give_others(sound, trained, optimizer))
 
 
 def give_harmonics(parts: Sequence[Part], trained: Gaussians, modulated: Gaussians) -> None:

@@ -104,11 +104,6 @@ def check_same(
             )
 
 
-def freed(saved: dict[str, Any], here: dict[str, Any]) -> list[str]:
-    """Of FREE_FIELDS, those for which something else is asked now."""
-    return [name for name in FREE_FIELDS if saved.get(name) != here.get(name)]
-
-
 def check_scene(path: str | Path, saved: object, scene: Scene) -> None:
     """ValueError, in the words of the options, where a fingerprint is not that of the scene."""
     if not isinstance(saved, dict):

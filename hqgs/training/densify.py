@@ -59,7 +59,7 @@ class Densifier:
         _rust.add_pulls(sums, views, gradient, seen, (width / 2, height / 2))
 
     def note(self, rows: Tensor, norms: Tensor) -> None:
-        """Add one view that shows the Gaussians of these rows, [M], with `gradient_norms` [M]."""
+        """Add one view that shows these rows, [M], whose gradients have these norms, half images."""
         self.grad_sum[rows] += norms
         self.count[rows] += 1
 
@@ -86,12 +86,6 @@ class Densifier:
         select_rows(gaussians, optimizer, kept, old=len(kept))
         self.grad_sum, self.count = self.grad_sum[kept], self.count[kept]
         return kept
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return {"grad_sum": self.grad_sum, "count": self.count}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.grad_sum, self.count = state["grad_sum"], state["count"]
 
     def _clone_and_split(
         self, iteration: int, gaussians: Gaussians, optimizer: Optimizer, finest: Tensor | None
@@ -140,12 +134,6 @@ class Densifier:
         select_rows(gaussians, optimizer, kept, old=len(kept))
         parents = kept if densified.parents is None else densified.parents[kept]
         return replace(densified, pruned=pruned, parents=parents)
-
-
-def gradient_norms(means2d_grad: Tensor, width: int, height: int) -> Tensor:
-    """Of gradients of 2D means, [N, 2] in loss per pixel, in loss per half image, [N]."""
-    # A pixel is 2 / width of normalised device coordinates, in which the threshold is published.
-    return torch.hypot(means2d_grad[:, 0] * (width / 2), means2d_grad[:, 1] * (height / 2))
 
 
 def quats_to_matrices(quats: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from hqgs.scene.scene import Scene
 from hqgs.training.config import AUTO, FORMATION, TrainConfig
 from hqgs.training.forward import TrainingViews
 from hqgs.training.frame import Frame, Trainable, with_rounded_poses
-from hqgs.training.methods import make_method
+from hqgs.training.methods import MAKERS
 from hqgs.training.methods.base import Method
 from hqgs.training.plan import Facts, RunPlan, StepSeconds
 from hqgs.training.rules import OF_PHOTOS_ALONE, RULES, growth_in_doubt, plan_run
@@ -67,7 +67,7 @@ class Prepared:
 
     def form(self, settings: TrainConfig, inspector: Inspector) -> None:
         """Make the method of these settings, which has learned nothing, and what renders are compared to."""
-        self.method: Method[Any] = make_method(self.scene, settings, inspector)
+        self.method: Method[Any] = MAKERS[settings.method](self.scene, settings, inspector)
         self.training_views: TrainingViews = TrainingViews(self.scene.train, self.method, settings.background)
         self.facts = self.method.facts(self.facts, self.training_views.targets)
 

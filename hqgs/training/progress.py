@@ -30,16 +30,15 @@ class Progress:
     evaluated: HistoryEntry | None  # where the held-out views were measured after this step
     diagnosis: Diagnosis | None = field(repr=False)  # of the photos; None: the method asked for none
     _step: Step = field(repr=False)
-    _model: Callable[[], Gaussians] = field(repr=False)
-    _left: Callable[[], float] = field(repr=False)
+    _trainer: Trainer = field(repr=False)
 
     def model(self) -> Gaussians:
         """The scene as it is rasterized now; its memory changes with the next step."""
-        return self._model()
+        return self._trainer.model()
 
     def left(self) -> float:
         """Seconds that the rest of the steps will take, about."""
-        return self._left()
+        return self._trainer.seconds_left()
 
     def psnr(self) -> float | None:
         """Of the render against the training photo, dB. None where it is infinite or nothing counts."""
@@ -48,21 +47,3 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
-
-
-def progress_of(trainer: Trainer, step: Step, evaluated: HistoryEntry | None) -> Progress:
-    """What `trainer` has just done; `evaluated`: the held-out means, where they were measured."""
-    return Progress(
-        iteration=trainer.iteration,
-        length=trainer.length,
-        seconds=trainer.seconds,
-        gaussians=len(trainer.gaussians),
-        loss=step.loss,
-        view=step.view.name,
-        render=step.render.numpy(),
-        evaluated=evaluated,
-        diagnosis=trainer.diagnosis,
-        _step=step,
-        _model=trainer.model,
-        _left=trainer.seconds_left,
-    )

@@ -69,18 +69,13 @@ class Draft:
         self.diagnosis = diagnosis
         self.asked = asked
         self.plan: RunPlan = RunPlan(asked, facts.points)
-        self._rule: tuple[str, str] = ("", "")  # what the rule at work decides; its name and source
-
-    def follow(self, rule: Rule) -> None:
-        """Let a rule decide."""
-        self._rule = rule.what, f"{rule.decide.__name__}: {rule.source}"
-        rule.decide(self)
+        self.rule: tuple[str, str] = ("", "")  # what the rule at work decides; its name and source
 
     def note(
         self, value: str, why: str, evidence: str = "", left_out: str | None = None, what: str | None = None
     ) -> None:
         """Add a row of the rule at work; `what` it decides, where that is not what the rule is called."""
-        name, source = self._rule
+        name, source = self.rule
         row = PlanRow(what or name, value, why, evidence, source, 0, left_out)
         self.change(rows=(*self.plan.rows, row))
 
@@ -529,7 +524,8 @@ def plan_run(
     """The plan of a run. `diagnosis`: None where nobody has looked at the photos."""
     draft = Draft(facts, diagnosis, asked)
     for rule in rules:
-        draft.follow(rule)
+        draft.rule = rule.what, f"{rule.decide.__name__}: {rule.source}"
+        rule.decide(draft)
     return draft.plan
 
 

@@ -89,7 +89,7 @@ class TrainState:
         """All of its tensors by name, for a checkpoint."""
         tensors = {f"gaussians.{name}": tensor for name, tensor in self.gaussians.named().items()}
         tensors |= {f"average.{name}": tensor for name, tensor in self.average.means.items()}
-        tensors |= {f"densify.{name}": tensor for name, tensor in self.densifier.state_dict().items()}
+        tensors |= {"densify.grad_sum": self.densifier.grad_sum, "densify.count": self.densifier.count}
         for prefix, param in _moments(self.optimizer):
             for key, value in self.optimizer.state.get(param, {}).items():
                 tensors[prefix + key] = torch.as_tensor(value)
@@ -144,10 +144,9 @@ class TrainState:
                     check(prefix + key, state[key], param)
                 check(f"{prefix}step", state["step"], torch.tensor(0.0))
                 optimizer.state[param] = state
-        statistics = part("densify.", tensors)
-        for name, tensor in statistics.items():
-            check(f"densify.{name}", tensor, torch.empty(n))
-        self.densifier.load_state_dict(statistics)
+        for name in ("grad_sum", "count"):
+            check(f"densify.{name}", tensors[f"densify.{name}"], torch.empty(n))
+            setattr(self.densifier, name, tensors[f"densify.{name}"])
         return TrainState(
             gaussians,
             optimizer,

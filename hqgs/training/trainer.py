@@ -101,11 +101,6 @@ class Trainer:
         return self.plan.settings
 
     @property
-    def rows(self) -> list[PlanRow]:
-        """What was decided, before the first step and since."""
-        return [*self.plan.rows, *self.state.rows]
-
-    @property
     def gaussians(self) -> Gaussians:
         """Those that are trained; `shown` gives those that are rasterized."""
         return self.state.gaussians
@@ -271,7 +266,11 @@ class Trainer:
                 self.begin(self.prepared.plan())
                 meta["decisions"] = decisions | {"length": more, "released": decisions["released"] or done}
             else:
-                new = {name: getattr(self.config, name) for name in checkpoint.freed(meta["asked"], asked)}
+                new = {
+                    name: getattr(self.config, name)
+                    for name in checkpoint.FREE_FIELDS
+                    if meta["asked"].get(name) != asked.get(name)
+                }
                 self.begin(replace(saved, settings=replace(saved.settings, **new)))
             state = self.state.restored(path, tensors, meta, self._optimizer)
             state.recent.extend(meta["recent"])

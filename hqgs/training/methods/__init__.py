@@ -13,22 +13,13 @@ from hqgs.training.methods.hqgs import HQGS
 from hqgs.training.methods.paper import PaperHQGS
 from hqgs.training.methods.srgs import SRGS
 
-
-def make_hqgs(scene: Scene, config: TrainConfig, inspector: Inspector) -> Method[Any]:
-    """HQGS with the guidance that the configuration names."""
-    if config.hqgs.guidance == PAPER:
-        return PaperHQGS(scene, config.seed)
-    return HQGS(scene, config.hqgs, inspector, config.seed)
-
-
 # By the names of `METHODS`: scene, configuration, and what inspects photos, of which each knows the others'.
 MAKERS: dict[str, Callable[[Scene, TrainConfig, Inspector], Method[Any]]] = {
     "3dgs": lambda scene, config, inspector: ThreeDGS(),
     "srgs": lambda scene, config, inspector: SRGS(config.srgs),
-    "hqgs": make_hqgs,
+    "hqgs": lambda scene, config, inspector: (
+        PaperHQGS(scene, config.seed)
+        if config.hqgs.guidance == PAPER
+        else HQGS(scene, config.hqgs, inspector, config.seed)
+    ),
 }
-
-
-def make_method(scene: Scene, config: TrainConfig, inspector: Inspector) -> Method[Any]:
-    """The method that `config` names, for this scene; `inspector` diagnoses its photos where it asks."""
-    return MAKERS[config.method](scene, config, inspector)

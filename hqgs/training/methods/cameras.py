@@ -179,7 +179,10 @@ class LearnedCameras:
             for gains in (log_gains if log_gains is not None else [])
         ]
         self._mean = torch.stack([gains.detach() for gains in self._gains] or [torch.zeros(3)]).mean(0)
-        self._lenses = [first_lens(width).requires_grad_() for width in (self._widths if focus else [])]
+        self._lenses = [  # all of the photo out of focus alike, by little
+            torch.tensor([0.0, FIRST_RADIUS * width], dtype=torch.float64, requires_grad=True)
+            for width in (self._widths if focus else [])
+        ]
         self._nearness: list[Tensor | None] = [None] * count
         self._visits = torch.zeros(count, dtype=torch.int64)
         self._still = torch.full((count,), not shake)
@@ -468,11 +471,6 @@ def _squares(height: int, width: int, center: tuple[float, float], dtype: torch.
 
 def _trained(values: Iterable[NDArray[np.float64]]) -> list[Tensor]:
     return [torch.from_numpy(value.copy()).requires_grad_() for value in values]
-
-
-def first_lens(width: float) -> Tensor:
-    """Of a photo of this width: all of it out of focus alike, by little."""
-    return torch.tensor([0.0, FIRST_RADIUS * width], dtype=torch.float64)
 
 
 def widest(slope: float, offset: float) -> float:

@@ -25,15 +25,9 @@ from hqgs.training.config import AUTO
 from hqgs.training.methods.base import Target
 
 BLOCK = 8
-# R, G, B to Y, Cb, Cr (ITU-T T.871, without the offset of the chroma, which no difference sees).
-
-
-@dataclass(frozen=True)
-class Coefficients:
-    """DCT coefficients on the scale where white is 1."""
-
-    luma: Tensor  # [rows, columns, 1], padded to whole blocks
-    chroma: Tensor  # [rows, columns, 2] of the channels at half the size
+# DCT coefficients on the scale where white is 1: of luma [rows, columns, 1], padded to whole blocks, and of
+# chroma [rows, columns, 2], of the channels at half the size.
+Coefficients = list[Tensor]
 
 
 class JpegCells:
@@ -48,21 +42,21 @@ class JpegCells:
 
     def __init__(self, tables: Tables, height: int, width: int) -> None:
         """`height`, `width`: of the photo, px."""
+        # R, G, B to Y, Cb, Cr (ITU-T T.871, without the offset of the chroma, which no difference sees).
         to_ycbcr = np.array(
             [[0.299, 0.587, 0.114], [-0.168735892, -0.331264108, 0.5], [0.5, -0.418687589, -0.081312411]]
         )
-        rows, columns = (_analysis(side, halve=False) for side in (height, width))
-        self._luma = Separable.of(rows, columns, to_ycbcr[:1])
-        rows, columns = (_analysis(side, halve=True) for side in (height, width))
-        self._chroma = Separable.of(rows, columns, to_ycbcr[1:])
-        luma, chroma = (torch.tensor(table).reshape(BLOCK, BLOCK) / 255 for table in tables)
-        self._luma_steps = _tile(luma, self._luma, 1)
-        self._chroma_steps = _tile(chroma, self._chroma, 2)
+        self._parts: list[tuple[Separable, Tensor]] = []  # luma and chroma, and the steps of each
+        for table, halve, channels in zip(tables, (False, True), (to_ycbcr[:1], to_ycbcr[1:]), strict=True):
+            operator = Separable.of(_analysis(height, halve), _analysis(width, halve), channels)
+            rows, columns = (side // BLOCK for side in operator.size)
+            steps = (torch.tensor(table).reshape(BLOCK, BLOCK) / 255).repeat(rows, columns)[..., None]
+            self._parts.append((operator, steps.repeat(1, 1, len(channels))))
         self._pixels = height * width
 
     def coefficients(self, image: Tensor) -> Coefficients:
         """Of a picture [H, W, 3], white at 1; differentiable."""
-        return Coefficients(self._luma(image), self._chroma(image))
+        return [operator(image) for operator, _ in self._parts]
 
     def centres(self, photo: Tensor) -> Coefficients:
         """The centres of the cells of a decoded photo [H, W, 3]: the nearest multiples of the steps.
@@ -70,8 +64,7 @@ class JpegCells:
         Decoding clips, rounds and smooths the chroma, so the coefficients of the decoded pixels are a little
         off the multiples that the file holds.
         """
-        c = self.coefficients(photo)
-        return Coefficients(_nearest(c.luma, self._luma_steps), _nearest(c.chroma, self._chroma_steps))
+        return [torch.round(operator(photo) / steps) * steps for operator, steps in self._parts]
 
     def loss(self, image: Tensor, centres: Coefficients) -> Tensor:
         """Mean distance to the cells per colour value, a scalar; 0 where the file could be this picture's.
@@ -80,9 +73,12 @@ class JpegCells:
             image: [H, W, 3], white at 1.
             centres: of the photo, of the image's dtype.
         """
-        c, scale = self.coefficients(image), 1 / (3 * self._pixels)
-        luma = _Distance.apply(c.luma, centres.luma, self._luma_steps, scale)
-        return luma + _Distance.apply(c.chroma, centres.chroma, self._chroma_steps, scale)
+        scale = 1 / (3 * self._pixels)
+        luma, chroma = (
+            _Distance.apply(operator(image), c, steps, scale)
+            for (operator, steps), c in zip(self._parts, centres, strict=True)
+        )
+        return luma + chroma
 
 
 class _Distance(torch.autograd.Function):
@@ -103,15 +99,6 @@ class _Distance(torch.autograd.Function):
     ) -> tuple[Tensor, None, None, None]:
         (grad,) = ctx.saved_tensors
         return v_distance * grad, None, None, None
-
-
-def _nearest(c: Tensor, steps: Tensor) -> Tensor:
-    return torch.round(c / steps) * steps
-
-
-def _tile(steps: Tensor, operator: Separable, channels: int) -> Tensor:
-    rows, columns = (side // BLOCK for side in operator.size)
-    return steps.repeat(rows, columns)[..., None].repeat(1, 1, channels)
 
 
 def _analysis(side: int, halve: bool) -> NDArray[np.float64]:
@@ -139,7 +126,6 @@ PLATEAU_STEPS = 200  # from one look at them to the next, at least; without a ga
 class HeldPixels:
     """Pixels of one photo that its loss leaves out."""
 
-    photo: int  # its number in the scene
     places: Tensor  # [P], of the rows of the photo as [H W, 3]
     colors: Tensor  # [P, 3], white at 1
 
@@ -157,7 +143,7 @@ class HeldPixels:
         held = torch.from_numpy(drawn)
         counts.view(-1)[held] = False
         colors = torch.from_numpy(as_floats(photo.reshape(-1, 3)[held].numpy()))
-        return cls(number, held, colors), counts
+        return cls(held, colors), counts
 
     def error(self, image: Tensor) -> Tensor:
         """Mean squared error there of `image` [H, W, 3], a float64 scalar."""
@@ -232,7 +218,7 @@ class FormedTarget(Target):
     @property
     def kept(self) -> int:
         """Luma coefficients that the photo's file holds: those that its codec did not round to zero."""
-        return 0 if self.centres is None else int(torch.count_nonzero(self.centres.luma))
+        return 0 if self.centres is None else int(torch.count_nonzero(self.centres[0]))
 
 
 class Formation:
