@@ -23,8 +23,8 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d
 from tiny_scene import tiny_config
 
 import hqgs.diagnosis.scene as module
-from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene
-from hqgs.diagnosis.photo import inspect_photo
+from hqgs.diagnosis import Diagnosis, PhotoDiagnosis, diagnose_scene
+from hqgs.diagnosis.photo import conclude, inspect_photo
 from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.formula import parse_degradation, parse_formation
 from hqgs.photos.jpeg import encode_jpeg
@@ -53,6 +53,10 @@ def clean_photo(seed: int) -> NDArray[np.uint8]:
         fill = tuple(int(v) for v in np.clip(shade + tint, 1, 254))
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=fill)
     return np.asarray(picture.resize((WIDTH, HEIGHT), Image.Resampling.BOX))
+
+
+def diagnose_photo(image: np.ndarray, low: np.ndarray | None = None) -> PhotoDiagnosis:
+    return conclude([inspect_photo("photo", image, low)])[0]
 
 
 def degraded_scene(text: str, photos: int = PHOTOS, keep_low: bool = True) -> Scene:

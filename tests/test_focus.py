@@ -93,18 +93,19 @@ def test_what_photos_tell_of_their_focus() -> None:
     scene = at_two_depths(textured_scene())
     count = len(scene.train)
     clean = focus_signs(scene)
-    assert clean == focus.FocusSigns(0.0, 0.0)
+    assert clean == (0.0, 0.0)
     near_or_far = [(0.0, 1.0) if k % 2 else (1.0, 0.0) for k in range(count)]
     lens = focus_signs(softer(scene, near_or_far))
     assert lens is not None
-    assert lens.with_depth > GOES_WITH_DEPTH
+    assert lens[0] > GOES_WITH_DEPTH
     some = focus_signs(softer(scene, [(1.5, 1.5) if k % 2 else (0.0, 0.0) for k in range(count)]))
     assert some is not None
-    assert some.in_all > DIFFERS
-    assert some.with_depth < GOES_WITH_DEPTH
+    with_depth, in_all = some
+    assert in_all > DIFFERS
+    assert with_depth < GOES_WITH_DEPTH
     alike = focus_signs(softer(scene, [(1.5, 0.0)] * count))
     assert alike is not None
-    assert max(alike.with_depth, alike.in_all) < GOES_WITH_DEPTH / 2
+    assert max(alike) < GOES_WITH_DEPTH / 2
 
 
 def test_large_photos_are_looked_at_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,7 +114,7 @@ def test_large_photos_are_looked_at_smaller(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(focus, "FOCUS_LARGEST", 48)
     found = focus_signs(scene)
     assert found is not None
-    assert found.with_depth > GOES_WITH_DEPTH
+    assert found[0] > GOES_WITH_DEPTH
 
 
 def test_few_shared_points_tell_nothing() -> None:

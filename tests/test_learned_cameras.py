@@ -237,8 +237,9 @@ def test_gains_need_points_that_photos_share() -> None:
 def test_photos_that_were_shaken_differ_in_sharpness(kind: str, unlike: bool) -> None:
     found = unlike_sharpness(hqgs.degrade(textured_scene(), kind))
     assert found is not None
-    assert (found.sharpness >= UNLIKE and found.direction >= TURNED) == unlike
-    assert (found.sharpness >= UNLIKE) == (unlike or kind.startswith("some"))
+    sharpness, direction = found
+    assert (sharpness >= UNLIKE and direction >= TURNED) == unlike
+    assert (sharpness >= UNLIKE) == (unlike or kind.startswith("some"))
 
 
 def test_the_diagnosis_names_both() -> None:

@@ -1,6 +1,6 @@
 """Blind diagnosis of photo degradations: which of them a scene's photos show, and how strong they are."""
 
-from hqgs.diagnosis.photo import PhotoDiagnosis, diagnose_photo
+from hqgs.diagnosis.photo import PhotoDiagnosis
 from hqgs.diagnosis.scene import Diagnosis, Finding, diagnose_scene
 
-__all__ = ["Diagnosis", "Finding", "PhotoDiagnosis", "diagnose_photo", "diagnose_scene"]
+__all__ = ["Diagnosis", "Finding", "PhotoDiagnosis", "diagnose_scene"]

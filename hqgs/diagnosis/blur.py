@@ -35,24 +35,6 @@ RING_ERROR, POINT_ERROR = 0.2, 0.6
 UNKNOWN_FLOORS = (0.0, 0.1, 0.3, 1.0)
 
 
-@dataclass(frozen=True)
-class Spectrum:
-    """Mean power of a photo's windowed tiles, levels^2 per pixel, at centred frequencies."""
-
-    power: Floats  # [T, T]; zero frequency at [T // 2, T // 2]
-    tile: int  # T, even
-
-    @property
-    def step(self) -> float:
-        """Between frequencies, rad/px."""
-        return 2 * np.pi / self.tile
-
-    def frequencies(self) -> tuple[Floats, Floats]:
-        """Vertical [T, 1] and horizontal [1, T] frequencies, rad/px."""
-        along = (np.arange(self.tile) - self.tile // 2) * self.step
-        return along[:, None], along[None]
-
-
 def tile_size(grey: Floats) -> int | None:
     """Side of the tiles for a luma [H, W]; None for a photo too small for any."""
     short = min(grey.shape)
@@ -62,9 +44,9 @@ def tile_size(grey: Floats) -> int | None:
     return int(np.clip(short // 3, SMALLEST_TILE, LARGEST_TILE)) // 2 * 2
 
 
-def power_spectrum(grey: Floats, tile: int) -> Spectrum:
-    """Welch's estimate for a luma [H, W]: the mean over Hann-windowed tiles, which overlap by half
-    unless there are too many."""
+def power_spectrum(grey: Floats, tile: int) -> Floats:
+    """Welch's estimate for a luma [H, W]: mean power, levels^2 per pixel, [T, T], of Hann-windowed tiles of
+    an even side T, which overlap by half unless there are too many; zero frequency at [T // 2, T // 2]."""
     window = np.hanning(tile + 2)[1:-1]
     window = window[:, None] * window
     rows, columns = (_starts(size, tile) for size in grey.shape)
@@ -73,21 +55,22 @@ def power_spectrum(grey: Floats, tile: int) -> Spectrum:
         tiles = np.stack([grey[row : row + tile, column : column + tile] for column in columns])
         tiles = tiles - (tiles * window).sum(axis=(1, 2), keepdims=True) / window.sum()
         total += np.square(np.abs(np.asarray(fft2((tiles * window).astype(np.float32))))).sum(axis=0)
-    power = total / (len(rows) * len(columns) * np.square(window).sum())
-    return Spectrum(np.fft.fftshift(power), tile)
+    return np.fft.fftshift(total / (len(rows) * len(columns) * np.square(window).sum()))
 
 
-def rings(spectrum: Spectrum) -> tuple[Floats, Floats]:
+def rings(spectrum: Floats) -> tuple[Floats, Floats]:
     """Mean frequency (rad/px) and mean log power of rings one step wide; each [rings]."""
-    vertical, horizontal = spectrum.frequencies()
-    radius = np.hypot(vertical, horizontal).ravel()
-    ring = np.rint(radius / spectrum.step).astype(np.int64)
-    count = int(HIGHEST / spectrum.step) + 1
+    tile = len(spectrum)
+    step = 2 * np.pi / tile  # between frequencies, rad/px
+    along = (np.arange(tile) - tile // 2) * step
+    radius = np.hypot(along[:, None], along[None]).ravel()
+    ring = np.rint(radius / step).astype(np.int64)
+    count = int(HIGHEST / step) + 1
     inside = ring < count
     number = np.bincount(ring[inside], minlength=count).astype(np.float64)
-    log_power = np.log(spectrum.power.ravel()[inside] + FLOOR)
+    log_power = np.log(spectrum.ravel()[inside] + FLOOR)
     means = (np.bincount(ring[inside], x, count) / number for x in (radius[inside], log_power))
-    first = 2 if spectrum.tile < 100 else 3  # the lowest rings hold few samples and the window's leakage
+    first = 2 if tile < 100 else 3  # the lowest rings hold few samples and the window's leakage
     frequency, power = (mean[first:] for mean in means)
     return frequency, power
 
@@ -170,7 +153,7 @@ def estimate_blur(levels: Floats, noise: float) -> Blur | None:
     known = (LUMA_NOISE * noise) ** 2 + FLOOR
     if (log_power > np.log(known) + 1).sum() < 3:  # as many as the law and a blur have unknowns
         return None
-    blurs = [_round_blurs(kind, sizes, frequency, spectrum.step) for kind, sizes in ROUND]
+    blurs = [_round_blurs(kind, sizes, frequency, 2 * np.pi / tile) for kind, sizes in ROUND]
     fits = [
         (*(fit_blurs(frequency, log_power, RING_ERROR, blur, floor) for blur in blurs), floor)
         for floor in known + np.array(UNKNOWN_FLOORS)
@@ -191,26 +174,27 @@ def extra_sigma(sigma: float) -> float:
     return float(np.sqrt(max(sigma**2 - 0.3**2, 0)))
 
 
-def _motion(spectrum: Spectrum, floor: float, sigma: float, radius: float) -> Blur | None:
+def _motion(spectrum: Floats, floor: float, sigma: float, radius: float) -> Blur | None:
     """A straight motion, where it explains the plane of frequencies clearly better than round blurs."""
-    at, chosen = _half_plane(spectrum.tile)
+    at, chosen = _half_plane(len(spectrum))
+    step = 2 * np.pi / len(spectrum)
     frequency = np.hypot(*at)
-    log_power = np.log(spectrum.power.ravel()[chosen] + FLOOR)
+    log_power = np.log(spectrum.ravel()[chosen] + FLOOR)
 
     def fit(log_blurs: Floats) -> Floats:
         return fit_blurs(frequency, log_power, POINT_ERROR, log_blurs, floor, steps=4)
 
     near = np.linspace(0.8, 1.2, 5)
     still = min(
-        fit(_round_blurs("gaussian", near * sigma, frequency, spectrum.step)).min(),
-        fit(_round_blurs("defocus", near * radius, frequency, spectrum.step)).min(),
+        fit(_round_blurs("gaussian", near * sigma, frequency, step)).min(),
+        fit(_round_blurs("defocus", near * radius, frequency, step)).min(),
     )
-    coarse = fit(_coarse_motions(spectrum.tile))
+    coarse = fit(_coarse_motions(len(spectrum)))
     if coarse.min() >= still:
         return None
     angle = float(np.repeat(ANGLES, len(BLUR_LENGTHS))[coarse.argmin()])
     lengths, angles = (a.ravel() for a in np.meshgrid(FINE_LENGTHS, angle + np.deg2rad([-4.0, 0.0, 4.0])))
-    moved = fit(_motions(lengths, angles, at, spectrum.step))
+    moved = fit(_motions(lengths, angles, at, step))
     length = float(lengths[moved.argmin()])
     if moved.min() >= CLEARLY * still:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,13 +39,7 @@ class Sight:
         return covered
 
 
-@dataclass(frozen=True)
-class _Drop:
-    """A photo to leave out."""
-
-    view: View
-    why: str
-    evidence: str
+Drop = tuple[View, LeftOut]  # a photo to leave out, and why
 
 
 def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
@@ -64,7 +58,7 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
         return scene, []
     bad = [_bad_values(view) for view in scene.train]
     drops = [
-        _Drop(view, "NaN or Inf in its pixels", f"{count} of {view.image.size} values")
+        _drop(view, "NaN or Inf in its pixels", f"{count} of {view.image.size} values")
         for view, count in zip(scene.train, bad, strict=True)
         if count
     ]
@@ -73,14 +67,17 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
     if sound:
         drops += _needless(sound, scene.points, notes)
     if len(drops) > most:
-        names = some([drop.view.name for drop in drops[most:]])
+        names = some([view.name for view, _ in drops[most:]])
         notes.append(f"these bad training photos are used, so that at least half of the photos stay: {names}")
         drops = drops[:most]
     if not drops and not notes:
         return scene, []
-    train = [view for view in scene.train if not any(view is drop.view for drop in drops)]
-    left_out = [LeftOut(f"{PHOTO}{d.view.name}", d.why, d.evidence) for d in drops]
-    return replace(scene, train=train, notes=[*scene.notes, *notes]), left_out
+    train = [view for view in scene.train if not any(view is gone for gone, _ in drops)]
+    return replace(scene, train=train, notes=[*scene.notes, *notes]), [why for _, why in drops]
+
+
+def _drop(view: View, why: str, evidence: str) -> Drop:
+    return view, LeftOut(f"{PHOTO}{view.name}", why, evidence)
 
 
 def _bad_values(view: View) -> int:
@@ -88,7 +85,7 @@ def _bad_values(view: View) -> int:
     return sum(int((~np.isfinite(p)).sum()) for p in photos if p is not None and p.dtype != np.uint8)
 
 
-def _needless(views: list[View], points: NDArray[np.float32], notes: list[str]) -> list[_Drop]:
+def _needless(views: list[View], points: NDArray[np.float32], notes: list[str]) -> list[Drop]:
     """The worst first. What was nearly left out is told in `notes`."""
     looks = summarised(views)
     sight = Sight(views, points)
@@ -110,14 +107,14 @@ def _peers(sight: Sight, view: int) -> NDArray[np.int64]:
 
 def _empty(
     views: Sequence[View], looks: Sequence[PhotoSummary], peers: Sequence[NDArray[np.int64]]
-) -> dict[int, _Drop]:
+) -> dict[int, Drop]:
     """Photos with nothing on them, although others of the same points show something."""
     drops = {}
     full = np.array([look.colour is None for look in looks])
     for k, (view, look) in enumerate(zip(views, looks, strict=True)):
         if view.mask is not None:
             if not view.mask.any():
-                drops[k] = _Drop(view, "covered by its mask", "0 pixels count")
+                drops[k] = _drop(view, "covered by its mask", "0 pixels count")
             continue
         others = int(full[peers[k]].sum())
         if look.colour is None or others < ENOUGH_SHOW or 2 * others <= len(peers[k]):
@@ -126,7 +123,7 @@ def _empty(
             f"its colour is {', '.join(f'{c:.0f}' for c in look.colour)} with a standard deviation of "
             f"{look.spread:.1f} levels; {others} of {len(peers[k])} photos of the same points show detail"
         )
-        drops[k] = _Drop(view, "of one colour only", evidence)
+        drops[k] = _drop(view, "of one colour only", evidence)
     return drops
 
 
@@ -137,7 +134,7 @@ def _blurred(
     peers: Sequence[NDArray[np.int64]],
     gone: set[int],
     notes: list[str],
-) -> dict[int, _Drop]:
+) -> dict[int, Drop]:
     """Photos far blurrier than others of the same points, but for those in `gone`; the blurriest first."""
     sigmas: dict[int, float] = {}
     for k in range(len(views)):
@@ -162,7 +159,7 @@ def _blurred(
             f"as blurred as other photos after a Gaussian blur of sigma {sigmas[k]:.1f} px (left out from "
             f"{least:.1f} px); at least {ENOUGH_SHOW} sharper photos see {well_seen:.0%} of its points"
         )
-        drops[k] = _Drop(views[k], "far blurrier than other photos of the same things", evidence)
+        drops[k] = _drop(views[k], "far blurrier than other photos of the same things", evidence)
     if needed:
         notes.append(
             f"these blurred training photos are used, as fewer than {ENOUGH_SHOW} sharper ones see some of "

@@ -26,7 +26,7 @@ from hqgs.scene.scene import Scene, View
 
 CHOICE_SIGMAS = np.arange(-3, 10.01, 0.25)  # px; below 0: sharper than the others
 
-UNLIKE, TURNED = 0.18, 0.45  # from these values of `Unlike` on, photos were shaken
+UNLIKE, TURNED = 0.18, 0.45  # from these values of `unlike_sharpness` on, photos were shaken
 SECTORS = 8  # directions of frequencies
 UNLIKE_COARSE, UNLIKE_FINE = (0.03, 0.1), (0.15, 0.4)  # frequencies, cycles per px
 
@@ -56,18 +56,13 @@ def summarised(views: Sequence[View]) -> list[PhotoSummary]:
     known = [tile for tile in tiles if tile is not None]
     # One size for all, so that their frequencies are the same.
     tile = min(known) if len(known) == len(views) > 0 else None
-    return [_summary(photo, view.name, tile) for photo, view in zip(photos, views, strict=True)]
-
-
-def _summary(photo: NDArray[Any], name: str, tile: int | None) -> PhotoSummary:
-    levels = to_levels(photo, f"photo {name!r}")
-    grey = luma(levels)
-    spread = float(grey.std())
-    return PhotoSummary(
-        colour=_flat_colour(levels),
-        spread=spread,
-        rings=None if tile is None else rings(power_spectrum(grey, tile)),
-    )
+    found = []
+    for photo, view in zip(photos, views, strict=True):
+        levels = to_levels(photo, f"photo {view.name!r}")
+        grey = luma(levels)
+        spectrum = None if tile is None else rings(power_spectrum(grey, tile))
+        found.append(PhotoSummary(_flat_colour(levels), float(grey.std()), spectrum))
+    return found
 
 
 def _flat_colour(levels: Floats) -> Floats | None:
@@ -89,10 +84,6 @@ class Sharpness:
         self._frequency = spectra[0][0]
         self._log_power = np.stack([log_power for _, log_power in spectra])  # [N, rings]
 
-    def quarters(self) -> NDArray[np.float64]:
-        """[4, N]: the log power of a quarter of the details each, from the coarsest to the finest."""
-        return np.stack([part.mean(1) for part in np.array_split(self._log_power, 4, axis=1)])
-
     def extra_blur(self, photo: int, others: NDArray[np.int64]) -> float:
         """Signed sigma (px) of the Gaussian that makes the median spectrum of `others` that of `photo`.
 
@@ -112,16 +103,10 @@ class Sharpness:
         return float(likely[np.abs(likely).argmin()])
 
 
-@dataclass(frozen=True)
-class Unlike:
-    """How photos differ from one another in the logarithms of their power spectra."""
-
-    sharpness: float  # by how much more in fine details than in coarse ones, standard deviations over photos
-    direction: float  # standard deviation over photos and directions of the finer details, less each mean
-
-
-def unlike_sharpness(scene: Scene) -> Unlike | None:
-    """Of the training photos; None where they are too few or too small to tell.
+def unlike_sharpness(scene: Scene) -> tuple[float, float] | None:
+    """How training photos differ in the logarithms of their power spectra, standard deviations over photos:
+    by how much more in fine details than in coarse ones; and in the directions of the finer details, less
+    each mean. None where they are too few or too small to tell.
 
     What happens to all photos alike (blur, noise, JPEG, shrinking) moves them together: sharpness differs by
     less than 0.15 then, and by 0.25 to 1.3 where each photo was shaken in its own way. Shake takes the fine
@@ -135,7 +120,9 @@ def unlike_sharpness(scene: Scene) -> Unlike | None:
     rings = [found for found in looks if found is not None]
     if len(rings) < len(looks):
         return None
-    quarters = Sharpness(rings).quarters()
+    log_power = np.stack([log_power for _, log_power in rings])
+    # [4, N]: of a quarter of the details each, from the coarsest to the finest
+    quarters = np.stack([part.mean(1) for part in np.array_split(log_power, 4, axis=1)])
     directions = np.stack([_directions(view.image) for view in scene.train])
     faces = np.array([view.face for view in scene.train])
     for face in np.unique(faces):
@@ -145,7 +132,7 @@ def unlike_sharpness(scene: Scene) -> Unlike | None:
         directions[alike] -= np.median(directions[alike], axis=0)
     coarse, *finer = quarters.std(axis=1)
     directions -= directions.mean(1, keepdims=True)
-    return Unlike(float(max(finer) - coarse), float(directions.std()))
+    return float(max(finer) - coarse), float(directions.std())
 
 
 def _directions(photo: NDArray[Any]) -> NDArray[np.float64]:
@@ -170,10 +157,9 @@ def shake_finding(scene: Scene) -> Finding:
     unlike = unlike_sharpness(scene)
     if unlike is None:
         return Finding("shake", "not measured: the photos are too few or too small")
-    reason = (
-        f"photos differ by {unlike.sharpness:.2f} in sharpness, by {unlike.direction:.2f} in its direction"
-    )
-    if unlike.sharpness < UNLIKE or unlike.direction < TURNED:
+    sharpness, direction = unlike
+    reason = f"photos differ by {sharpness:.2f} in sharpness, by {direction:.2f} in its direction"
+    if sharpness < UNLIKE or direction < TURNED:
         reason += f" (needed from {UNLIKE:g} and {TURNED:g}, in the logarithm of the power of fine details)"
-        return Finding("shake", reason, None, unlike.sharpness)
-    return Finding("shake", reason, "shake", unlike.sharpness)
+        return Finding("shake", reason, None, sharpness)
+    return Finding("shake", reason, "shake", sharpness)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from hqgs.scene.scene import Scene, View
 
 Floats = NDArray[np.float64]
 ROUNDS = 30  # of medians of photos and points in turn
-GOES_WITH_DEPTH, DIFFERS = 0.06, 0.4  # from these values of `FocusSigns` on, photos differ in focus
+GOES_WITH_DEPTH, DIFFERS = 0.06, 0.4  # from these values of `focus_signs` on, photos differ in focus
 MOST_PHOTOS, FOCUS_MOST_POINTS = 60, 4000  # that are looked at
 # px: sigmas between which details lie, and the window around a point
 FOCUS_FINE, FOCUS_COARSE, FOCUS_WINDOW = 0.8, 2.4, 9
@@ -27,19 +26,11 @@ FOCUS_LARGEST = 2000  # px: the longest side of what is looked at of a photo
 FOCUS_DARK = 0.5 / 255  # contrast below which there is nothing to be sharp
 
 
-@dataclass(frozen=True)
-class FocusSigns:
-    """How the sharpness of points (half the log ratio of the power of fine details to coarser ones) differs.
-
-    Both are standard deviations over photos, of what two halves of the points agree on.
-    """
-
-    with_depth: float  # of the part that goes with nearness, at one standard deviation of it
-    in_all: float  # of the rest
-
-
-def focus_signs(scene: Scene) -> FocusSigns | None:
-    """Of the training photos; None where they are few, share few points, or it is not told which they show.
+def focus_signs(scene: Scene) -> tuple[float, float] | None:
+    """How the sharpness of points (half the log ratio of the power of fine details to coarser ones) differs
+    over training photos, standard deviations of what two halves of the points agree on: of the part that goes
+    with nearness, at one standard deviation of it, and of the rest, `in_all`. None where photos are few,
+    share few points, or it is not told which they show.
 
     What a point is like drops out, as all photos show it, and so does what comes with its distance. A lens
     that is focused nearer in one photo than in the next leaves 0.12 in the room that is built in, where
@@ -61,7 +52,8 @@ def focus_signs(scene: Scene) -> FocusSigns | None:
         return None
     sharp, depths = sharp[:, keep], np.where(told, depths, np.nan)[:, keep]
     halves = [_of_photos(sharp[:, half::2], depths[:, half::2]) for half in (0, 1)]
-    return FocusSigns(*(_agreed(first, second) for first, second in zip(*halves, strict=True)))
+    with_depth, in_all = (_agreed(first, second) for first, second in zip(*halves, strict=True))
+    return with_depth, in_all
 
 
 def _look(view: View, points: Floats, rows: NDArray[np.intp], sharp: Floats, depths: Floats) -> None:
@@ -125,11 +117,12 @@ def focus_finding(scene: Scene, shaken: bool) -> Finding:
     signs = focus_signs(scene)
     if signs is None:
         return Finding("focus", "not measured: the photos share too few points")
-    needed = signs.with_depth >= GOES_WITH_DEPTH or (signs.in_all >= DIFFERS and not shaken)
+    with_depth, in_all = signs
+    needed = with_depth >= GOES_WITH_DEPTH or (in_all >= DIFFERS and not shaken)
     reason = (
-        f"the sharpness of points differs from photo to photo by {signs.with_depth:.2f} with their distance, "
-        f"by {signs.in_all:.2f} in all"
+        f"the sharpness of points differs from photo to photo by {with_depth:.2f} with their distance, "
+        f"by {in_all:.2f} in all"
     )
     if not needed:
         reason += f" (needed from {GOES_WITH_DEPTH:g} or {DIFFERS:g}, in the logarithm of contrast)"
-    return Finding("focus", reason, "focus" if needed else None, signs.with_depth)
+    return Finding("focus", reason, "focus" if needed else None, with_depth)

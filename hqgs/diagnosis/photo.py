@@ -227,17 +227,12 @@ class Inspected:
         return found if found is not None and self.diagnosis.hiding else ROUNDING_ONLY
 
 
-def diagnose_photo(image: Photo, low: Photo | None = None) -> PhotoDiagnosis:
-    """What degraded a photo [H, W, 3]: enlargement, then of the small photo JPEG, noise and blur.
-
-    `low` is the small photo [h, w, 3] where it is at hand. ValueError for another shape or type, values that
-    are not finite, or a `low` larger than the photo.
-    """
-    return conclude([inspect_photo("photo", image, low)])[0]
-
-
 def inspect_photo(name: str, image: Photo, low: Photo | None = None, film: float | None = None) -> Inspected:
-    """The first half of `diagnose_photo`, errors included; `film`: `View.film`, where known."""
+    """What degraded a photo [H, W, 3]: enlargement, then of the small photo JPEG; the rest `conclude` tells.
+
+    `low` is the small photo [h, w, 3] where it is at hand, `film`: `View.film`, where known. ValueError for
+    another shape or type, values that are not finite, or a `low` larger than the photo.
+    """
     levels = to_levels(image, f"photo {name!r}")
     height, width = levels.shape[:2]
     if low is not None:
