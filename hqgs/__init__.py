@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from hqgs.diagnosis.scene import Diagnosis as Diagnosis
     from hqgs.diagnosis.scene import diagnose_scene
     from hqgs.model.gaussians import Gaussians as Gaussians
+    from hqgs.model.gaussians import orbit as orbit
     from hqgs.model.gsplat_kernels import gsplat_on_cpu as gsplat_on_cpu
-    from hqgs.model.orbit import orbit as orbit
     from hqgs.model.rasterization import RasterizationMeta as RasterizationMeta
     from hqgs.model.rasterization import rasterization as rasterization
     from hqgs.photos.pixels import picture as picture
@@ -45,9 +45,8 @@ _HOMES = {
     "hqgs._rust": "get_num_threads set_num_threads",
     "hqgs.base.files": "FolderBusyError",
     "hqgs.diagnosis.scene": "Diagnosis diagnose:diagnose_scene",
-    "hqgs.model.gaussians": "Gaussians",
+    "hqgs.model.gaussians": "Gaussians orbit",
     "hqgs.model.gsplat_kernels": "gsplat_on_cpu",
-    "hqgs.model.orbit": "orbit",
     "hqgs.model.rasterization": "RasterizationMeta rasterization",
     "hqgs.photos.pixels": "picture",
     "hqgs.pipeline": "Run train",

@@ -133,7 +133,7 @@ def _cameras(
     options: Render, gaussians: Gaussians, run: RunFolder
 ) -> tuple[list[str] | None, list[Camera], float]:
     """Names of the pictures, if they have any, the cameras, and frames per second."""
-    from hqgs.model.orbit import orbit
+    from hqgs.model.gaussians import orbit
     from hqgs.photos.video import FPS
     from hqgs.scene.camera_files import load_path, moved, picked
     from hqgs.scene.paths import UP, camera_path

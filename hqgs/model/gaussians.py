@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from hqgs._rust import EPS2D, NEAR_PLANE
@@ -19,14 +19,13 @@ from hqgs.base.files import PLY
 from hqgs.base.state import own_state
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import MAX_SH_DEGREE, SH_C0
-from hqgs.model.content import around
-from hqgs.model.formats.arrays import TENSORS, Arrays
+from hqgs.model.formats.arrays import TENSORS, Arrays, whole_rows
 from hqgs.model.formats.files import format_of, read_scene, scene_file, write_scene
 from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.photos.pixels import png
 from hqgs.scene.camera_files import RunCameras, first_camera, moved_along
 from hqgs.scene.constants import BACKGROUND, SMALLEST, USUAL
-from hqgs.scene.paths import UP
+from hqgs.scene.paths import UP, circle, orbit_cameras
 from hqgs.scene.scene import Camera
 from hqgs.scene.world import World
 
@@ -88,10 +87,7 @@ class Gaussians:
 
     def finite(self) -> Tensor:
         """Which hold no NaN or Inf in any tensor, bool [N]."""
-        tensors = [
-            tensor.detach().reshape(len(self), *tensor.shape[1:], 1) for tensor in self.named().values()
-        ]
-        return torch.cat([tensor.flatten(1) for tensor in tensors], dim=1).isfinite().all(dim=1)
+        return torch.from_numpy(whole_rows(self.arrays()))
 
     def named(self) -> dict[str, Any]:
         """The tensors by name, in the order of the fields."""
@@ -130,8 +126,10 @@ class Gaussians:
         return max((there, known), key=lambda one: sum(in_frame(c, few).sum() for c in one.train))
 
     def near_plane(self) -> float:
-        """What is nearer to a camera than this is not rendered: less in a scene of small units."""
-        return near_for(self._few())
+        """What is nearer to a camera is not rendered: NEAR_PLANE, or less where its size is not ordinary."""
+        few = self._few()
+        size = float(np.median(np.linalg.norm(few - np.median(few, axis=0), axis=1))) if len(few) else 0
+        return NEAR_PLANE if not 0 < size < SMALLEST else NEAR_PLANE * 2.0 ** round(math.log2(size / USUAL))
 
     def _few(self) -> NDArray[np.float64]:
         few = self.means.detach()[:: max(1, len(self) // 4096)].double().numpy()
@@ -324,12 +322,6 @@ class Gaussians:
         )
 
 
-def near_for(points: NDArray[np.float64]) -> float:
-    """The near plane for a scene of points [P, 3]: NEAR_PLANE, or less where its size is not ordinary."""
-    size = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))) if len(points) else 0
-    return NEAR_PLANE if not 0 < size < SMALLEST else NEAR_PLANE * 2.0 ** round(math.log2(size / USUAL))
-
-
 def mean_square_distance(points: NDArray[np.floating]) -> NDArray[np.float64]:
     """Mean squared distance of each point [P, 3] to its 3 nearest other points, [P]."""
     from scipy.spatial import KDTree  # here: to render or to read a file needs no scipy
@@ -337,3 +329,61 @@ def mean_square_distance(points: NDArray[np.floating]) -> NDArray[np.float64]:
     xyz = points.astype(np.float64)
     distances, _ = KDTree(xyz).query(xyz, k=NEAREST + 1)  # the first is the point itself
     return np.square(distances[:, 1:]).mean(axis=1)
+
+
+def orbit(
+    about: Gaussians | Sequence[Camera],
+    frames: int = 120,
+    *,
+    up: ArrayLike | None = None,
+    like: Camera | None = None,
+) -> list[Camera]:
+    """Cameras on a path around a scene, all of which look at its middle.
+
+    Args:
+        about: the Gaussians, or cameras that look at the scene, such as those of the training views. The
+            cameras say how far away and how high the path is; if they stand on one side only, it is a small
+            ellipse on that side.
+        frames: how many, at least 1.
+        up: [3], the axis of the orbit; None: up as most of the cameras were held, and of Gaussians 0 -1 0,
+            as files of 3DGS have y down.
+        like: the camera whose size and intrinsics the orbit of Gaussians has; None: 504 x 378 px, 60 degrees.
+
+    Raises:
+        ValueError: no camera, no frame, or no Gaussian that can be seen.
+    """
+    if not isinstance(about, Gaussians):
+        return orbit_cameras(about, frames, up)
+    return around(about.means, about.opacities, frames, UP if up is None else up, like)
+
+
+def content(means: Tensor, opacities: Tensor) -> tuple[NDArray[np.float64], float]:
+    """Where most of a scene is: the middle [3] and a radius, world units, of `means` [N, 3].
+
+    Each Gaussian counts by its opacity, of which `opacities` [N] are logits. The middle is the median along
+    each axis, and 80 % lie within the radius, so that a few that are far away do not matter.
+
+    Raises ValueError where there is no Gaussian that is finite and can be seen.
+    """
+    points = means.detach().double().numpy()
+    weights = torch.sigmoid(opacities.detach().double()).numpy()
+    seen = np.isfinite(points).all(axis=1) & (weights > 0)
+    if not seen.any():
+        raise ValueError("the scene is empty: it has no Gaussian that can be seen")
+    points, weights = points[seen], weights[seen]
+    middle = np.array([_quantile(points[:, axis], weights, 0.5) for axis in range(3)])
+    radius = _quantile(np.linalg.norm(points - middle, axis=1), weights, 0.8)
+    return middle, radius or 1.0
+
+
+def around(means: Tensor, opacities: Tensor, frames: int, up: ArrayLike, like: Camera | None) -> list[Camera]:
+    """Cameras on a circle around the content, a little above it."""
+    middle, radius = content(means, opacities)
+    away = 2.2 * radius  # from where it fills the picture
+    return circle(middle, away, height=0.35 * away, frames=frames, up=up, like=like)
+
+
+def _quantile(values: NDArray[np.float64], weights: NDArray[np.float64], share: float) -> float:
+    order = values.argsort()
+    total = weights[order].cumsum()
+    return float(values[order][np.searchsorted(total, share * total[-1])])

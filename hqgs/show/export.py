@@ -23,8 +23,7 @@ from hqgs.model.formats.arrays import curve_order
 from hqgs.model.formats.beside import keep_world
 from hqgs.model.formats.files import FORMATS
 from hqgs.model.formats.spz import write_spz
-from hqgs.model.gaussians import Gaussians
-from hqgs.model.orbit import orbit
+from hqgs.model.gaussians import Gaussians, orbit
 from hqgs.scene.camera_files import RunCameras
 from hqgs.scene.constants import KEPT_SIDE
 from hqgs.scene.geometry import shrunk_camera

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hqgs.base.files import read_json, write_json
 from hqgs.base.ply import header_of
 from hqgs.model.formats.arrays import Arrays
-from hqgs.model.formats.ply_comments import OURS
+from hqgs.model.formats.ply import OURS
 from hqgs.model.formats.turned import near_origin, placed
 from hqgs.scene.world import World
 

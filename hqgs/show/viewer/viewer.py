@@ -18,10 +18,8 @@ from PIL import Image
 
 from hqgs.base.evenly import evenly
 from hqgs.evaluation.constants import MOST_CAMERAS
-from hqgs.model.content import content
 from hqgs.model.formats.turned import quaternions
-from hqgs.model.gaussians import Gaussians
-from hqgs.model.orbit import orbit
+from hqgs.model.gaussians import Gaussians, content, orbit
 from hqgs.scene.camera_files import KnownCamera, RunCameras, save_path
 from hqgs.scene.paths import UP, camera_path, focus
 from hqgs.scene.scene import Camera
