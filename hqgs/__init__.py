@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hqgs.model.rasterization import RasterizationMeta as RasterizationMeta
     from hqgs.model.rasterization import rasterization as rasterization
     from hqgs.photos.pixels import picture as picture
+    from hqgs.pipeline import Progress as Progress
     from hqgs.pipeline import Run as Run
     from hqgs.pipeline import train as train
     from hqgs.scene.camera_files import load_cameras as load_cameras
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from hqgs.show.frames import render_frames as render_frames
     from hqgs.training.config import TrainConfig as TrainConfig
     from hqgs.training.config import TrainingError as TrainingError
-    from hqgs.training.progress import Progress as Progress
 
     diagnose = diagnose_scene
 
@@ -49,14 +49,13 @@ _HOMES = {
     "hqgs.model.gsplat_kernels": "gsplat_on_cpu",
     "hqgs.model.rasterization": "RasterizationMeta rasterization",
     "hqgs.photos.pixels": "picture",
-    "hqgs.pipeline": "Run train",
+    "hqgs.pipeline": "Progress Run train",
     "hqgs.scene.camera_files": "load_cameras",
     "hqgs.scene.paths": "camera_path look_at",
     "hqgs.scene.scene": "Camera Scene View",
     "hqgs.scene.source": "degrade load",
     "hqgs.show.frames": "render_frames",
     "hqgs.training.config": "TrainConfig TrainingError",
-    "hqgs.training.progress": "Progress",
 }
 _NAMES = {name.partition(":")[0]: (home, name) for home, names in _HOMES.items() for name in names.split()}
 __all__ = ["__version__", *sorted(_NAMES)]  # pyright: ignore[reportUnsupportedDunderAll]

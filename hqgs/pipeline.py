@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hqgs import __version__
 from hqgs.base.files import (
@@ -28,8 +31,9 @@ from hqgs.base.options import called_with
 from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.state import own_state
-from hqgs.diagnosis.scene import Inspector
+from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
+from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, RunRecord, WorldRecord
 from hqgs.evaluation.report import write_report
 from hqgs.evaluation.run_folder import RunFolder
@@ -39,13 +43,55 @@ from hqgs.scene.photo_files import strangers
 from hqgs.scene.scene import Scene
 from hqgs.show.page.page import page_text, summary_html
 from hqgs.training.checkpoint import checksum, scene_fingerprint
-from hqgs.training.config import Said, TrainConfig, TrainOptions, decided, merged
+from hqgs.training.config import (
+    Said,
+    TrainConfig,
+    TrainOptions,
+    config_values,
+    decided,
+    merged,
+    plan_values,
+    resumed,
+    said_by,
+)
+from hqgs.training.forward import Step
 from hqgs.training.frame import Frame
 from hqgs.training.notes import fell_short, learned_record, photo_record, run_notes
 from hqgs.training.plan import essential
-from hqgs.training.progress import OnProgress, Progress
-from hqgs.training.settings import config_values, plan_values, resumed, said_by
 from hqgs.training.trainer import Trainer, fit_to_seconds
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a run has just done: one step."""
+
+    iteration: int  # steps done, those before a `resume` among them
+    length: int  # steps of the whole run, as far as it is known; it may get less
+    seconds: float  # of training so far
+    gaussians: int
+    loss: float
+    view: str  # the training view of the step
+    render: NDArray[np.float32]  # of that view, [H, W, 3], not clamped; may be smaller than the photo
+    evaluated: HistoryEntry | None  # where the held-out views were measured after this step
+    diagnosis: Diagnosis | None = field(repr=False)  # of the photos; None: the method asked for none
+    _step: Step = field(repr=False)
+    _trainer: Trainer = field(repr=False)
+
+    def model(self) -> Gaussians:
+        """The scene as it is rasterized now; its memory changes with the next step."""
+        return self._trainer.model()
+
+    def left(self) -> float:
+        """Seconds that the rest of the steps will take, about."""
+        return self._trainer.seconds_left()
+
+    def psnr(self) -> float | None:
+        """Of the render against the training photo, dB. None where it is infinite or nothing counts."""
+        step = self._step
+        return psnr(self.render, step.view.image, step.view.mask)
+
+
+OnProgress = Callable[[Progress], None]
 
 
 @dataclass(frozen=True)

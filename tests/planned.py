@@ -10,12 +10,11 @@ from typing import Any
 from tiny_scene import tiny_scene
 
 from hqgs.scene.scene import View
-from hqgs.training.config import TrainConfig, TrainOptions, decided, merged
+from hqgs.training.config import TrainConfig, TrainOptions, decided, merged, read_plan, said_by
 from hqgs.training.plan import RunPlan
 from hqgs.training.prepare import facts_of
 from hqgs.training.rules import plan_run
 from hqgs.training.schedule import Schedule
-from hqgs.training.settings import read_plan, said_by
 
 
 def run_config(**said: Any) -> TrainConfig:

@@ -29,10 +29,10 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, SfmReport
-from hqgs.training.length import seconds_left
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.plan import RunPlan
 from hqgs.training.schedule import Schedule
+from hqgs.training.trainer import seconds_left
 
 
 @pytest.fixture

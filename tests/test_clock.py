@@ -20,14 +20,12 @@ from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import rules
-from hqgs.training.config import DensifyConfig, TrainConfig, with_iterations
-from hqgs.training.length import by_the_clock
+from hqgs.training.config import DensifyConfig, TrainConfig, plan_values, with_iterations
 from hqgs.training.notes import run_notes
 from hqgs.training.plan import StepSeconds
 from hqgs.training.rules import FOR_EACH_PHOTO, GROWS_FROM, LEAST_ENOUGH, PIXELS
 from hqgs.training.schedule import Schedule
-from hqgs.training.settings import plan_values
-from hqgs.training.trainer import Trainer, fit_to_seconds
+from hqgs.training.trainer import Trainer, by_the_clock, fit_to_seconds
 
 N, STOP = 300, 200
 

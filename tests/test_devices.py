@@ -26,8 +26,7 @@ from hqgs.diagnosis.colors import (
     grouped,
     log_gains,
 )
-from hqgs.evaluation.held_out import HeldOutViews, measured
-from hqgs.evaluation.looks import look_of, looks_of_devices
+from hqgs.evaluation.held_out import HeldOutViews, look_of, looks_of_devices, measured
 from hqgs.evaluation.metrics import psnr
 from hqgs.photos.formula import DEVICES
 from hqgs.photos.light import to_linear, to_srgb

@@ -28,8 +28,7 @@ from hqgs.photos.film_colors import KNEE, as_photo, toned
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg, fine_detail
 from hqgs.photos.pixels import as_floats
 from hqgs.photos.resize import area_downscale
-from hqgs.photos.spherical import projection
-from hqgs.scene.film import film_frames, frame_details, frames_around
+from hqgs.scene.film import film_frames, frame_details, frames_around, projection
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable

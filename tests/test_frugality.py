@@ -16,7 +16,7 @@ from hqgs.base.left_out import CORRECTION, DIAGNOSIS, PHOTO, LeftOut, format_lef
 from hqgs.base.ranks import ALONE
 from hqgs.pipeline import train
 from hqgs.scene.scene import Scene
-from hqgs.training import length, rules
+from hqgs.training import rules
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig, parse_leave_out
 from hqgs.training.plan import left_out_of
 from hqgs.training.schedule import smaller
@@ -120,8 +120,8 @@ def test_a_smaller_view_shows_the_same_in_the_mean(dtype: type) -> None:
 
 
 def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(length, "CHECKS", 10)
-    monkeypatch.setattr(length, "PATIENCE", 40)
+    monkeypatch.setattr("hqgs.training.trainer.CHECKS", 10)
+    monkeypatch.setattr("hqgs.training.trainer.PATIENCE", 40)
     still = replace(STILL, stop=2_000)
     config = tiny_config(3_000, leave_out=("iterations",), lr_means=1e-7, lr_means_final=1e-9, densify=still)
     trainer = Trainer(tiny_scene(VIEWS), config)
@@ -139,8 +139,8 @@ def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch
 
 
 def test_photos_of_which_masks_leave_nothing_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(length, "CHECKS", 5)
-    monkeypatch.setattr(length, "PATIENCE", 10)
+    monkeypatch.setattr("hqgs.training.trainer.CHECKS", 5)
+    monkeypatch.setattr("hqgs.training.trainer.PATIENCE", 10)
     scene, config = tiny_scene(VIEWS), tiny_config(30, leave_out=("iterations",), densify=STILL)
     nothing = np.zeros((HEIGHT, WIDTH), bool)
     (held,) = Trainer(scene, config).schedule.held

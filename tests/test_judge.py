@@ -22,9 +22,8 @@ from hqgs.cli.main import main
 from hqgs.evaluation.causes import PARTS, causes, pixel_maps, shares, shown_by
 from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.evaluation.held_out import RenderedView
-from hqgs.evaluation.judge import flat_psnr
+from hqgs.evaluation.judge import VERSION, flat_psnr
 from hqgs.evaluation.metrics import METRICS
-from hqgs.evaluation.protocol import VERSION
 from hqgs.evaluation.verdict import judged_by, overdone, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source as scene_source

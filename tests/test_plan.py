@@ -23,11 +23,10 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.pipeline import open_run
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import rules
-from hqgs.training.config import PRESETS, HQGSConfig, with_iterations
+from hqgs.training.config import PRESETS, HQGSConfig, plan_values, with_iterations
 from hqgs.training.plan import RunPlan, StepSeconds
 from hqgs.training.prepare import Prepared, facts_of
 from hqgs.training.rules import PIXELS, RULES, Draft, Rule, first_points_wanted, plan_run
-from hqgs.training.settings import plan_values
 from hqgs.training.trainer import Trainer
 from hqgs.training.trial import _settings
 

@@ -17,8 +17,15 @@ from hqgs.cli.train import Train, asked_for, loading, read
 from hqgs.evaluation.verdict import verdict
 from hqgs.pipeline import train
 from hqgs.scene.options import LoadOptions
-from hqgs.training.config import PRESETS, TrainConfig, decided, with_iterations
-from hqgs.training.settings import config_values, read_said, said_by
+from hqgs.training.config import (
+    PRESETS,
+    TrainConfig,
+    config_values,
+    decided,
+    read_said,
+    said_by,
+    with_iterations,
+)
 
 
 def options(*arguments: str | Path) -> Train:

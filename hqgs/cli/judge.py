@@ -50,8 +50,13 @@ def run(options: Judge) -> int:
     if options.out is not None:
         check_out_folder(options.out)
     source, other, known = check_source(options.source, options.photos), None, None
-    from hqgs.evaluation.judge import compared  # here: they load torch
-    from hqgs.evaluation.protocol import check_comparable, chosen_views, protocol_of, read_judgement
+    from hqgs.evaluation.judge import (
+        check_comparable,
+        chosen_views,
+        compared,  # here: they load torch
+        protocol_of,
+        read_judgement,
+    )
     from hqgs.evaluation.run_folder import RunFolder
     from hqgs.model.formats.files import scene_file
 
@@ -118,8 +123,8 @@ def judge_file(
     fit: bool = False,
 ) -> tuple[dict[str, Any], HeldOutViews]:
     """A scene file, measured; what its reading left out is told."""
+    from hqgs.evaluation.held_out import looks_beside
     from hqgs.evaluation.judge import judge
-    from hqgs.evaluation.looks import looks_beside
     from hqgs.model.gaussians import Gaussians
 
     gaussians = Gaussians.load(file)

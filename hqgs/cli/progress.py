@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from hqgs.base.stages import Stage
-    from hqgs.training.progress import Progress
+    from hqgs.pipeline import Progress
 
 _MEASURED, _SOON = 35, 5.0  # steps, or s of them, after which the time that is left is told
 Self = TypeVar("Self", bound="Screen")

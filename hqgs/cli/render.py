@@ -66,7 +66,7 @@ def run(options: Render) -> int:
 
     file, run = scene_file(source), RunFolder.open(source)
     _check(options, run)
-    from hqgs.evaluation.looks import look_of
+    from hqgs.evaluation.held_out import look_of
     from hqgs.model.gaussians import Gaussians
     from hqgs.scene.paths import with_size
     from hqgs.show.frames import check_frames, render_frames, written_size  # here: they load torch

@@ -39,12 +39,13 @@ from hqgs.training.config import (
     decided,
     longest_side,
     merged,
+    read_plan,
+    read_said,
+    resumed,
 )
-from hqgs.training.settings import read_plan, read_said, resumed
 
 if TYPE_CHECKING:
-    from hqgs.pipeline import Run
-    from hqgs.training.progress import Progress
+    from hqgs.pipeline import Progress, Run
 
 EXPERT = "--config."
 VIEWERS = "SuperSplat (superspl.at/editor) and other 3DGS viewers"

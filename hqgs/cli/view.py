@@ -17,9 +17,9 @@ from hqgs.evaluation.run_folder import RunFolder
 from hqgs.show.viewer.guard import ELSEWHERE, PORT, check
 
 if TYPE_CHECKING:
+    from hqgs.pipeline import Progress
     from hqgs.scene.scene import Scene
     from hqgs.show.viewer.viewer import Viewer
-    from hqgs.training.progress import Progress
 
 EVERY = 2.0  # seconds between copies of the scene while it trains
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
 from hqgs.base.options import called_with, given
@@ -21,22 +22,22 @@ from hqgs.scene.axes import unseen, with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, odd_lenses, photo_folder
 from hqgs.scene.checks import broken, elsewhere, nothing
 from hqgs.scene.constants import BACKGROUND, COPY_SIDE, TEST_EVERY
-from hqgs.scene.faces import CUBE, around, faces_of
+from hqgs.scene.faces import CUBE, WIDE, around, face_name, faces_of
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import find_models, find_models_below, half_model, read_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
+from hqgs.scene.geometry import in_frame
 from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.names import existing_folder
 from hqgs.scene.options import LoadOptions
 from hqgs.scene.place import cut_outs, located, placed, without_missing, without_poseless, without_strays
 from hqgs.scene.random_points import with_first_points
-from hqgs.scene.scene import Scene, TrackStatistics, View
+from hqgs.scene.scene import Camera, Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import Search, read_photos
 from hqgs.scene.views import load_views
-from hqgs.scene.wide import with_faces
 
 COLMAP = "colmap"
 MOST_BYTES = 4e9  # of all photos, where `longest` bounds them; 1,000 of 1600 x 1200 px would be 5.8 GB
@@ -346,3 +347,40 @@ def held_out_names(
     files = list(dict.fromkeys(p.path for p in capture.photos))
     held = set(files[::test_every]) if test_every else set[Path]()
     return frozenset(p.name for p in capture.photos if p.path in held)
+
+
+def with_faces(capture: Capture) -> Capture:
+    """The capture with the faces of its wide photos in their place."""
+    faces = {photo.name: faces_of(photo.camera) for photo in capture.photos}
+    wide = [name for name, found in faces.items() if found]
+    if not wide:
+        return capture
+    called = {name: [face_name(name, face.name) for face in found] or [name] for name, found in faces.items()}
+    photos, seen = list[Photo](), dict[str, NDArray[np.intp]]()
+    for photo in capture.photos:
+        rows = None if capture.seen is None else capture.seen.get(photo.name)
+        if not faces[photo.name]:
+            photos.append(photo)
+            if rows is not None:
+                seen[photo.name] = rows
+        for name, face in zip(called[photo.name], faces[photo.name], strict=False):
+            viewmat = np.eye(4)
+            viewmat[:3] = face.rotation @ photo.viewmat[:3]
+            photos.append(replace(photo, name=name, viewmat=viewmat, face=face, film=None))
+            if rows is not None:
+                camera = Camera(face.width, face.height, face.K, viewmat)
+                seen[name] = rows[in_frame(camera, capture.points[rows].astype(np.float64))]
+    tests = capture.test_names
+    most = max(len(found) for found in faces.values())
+    note = (
+        f"{len(wide)} photos see {'all around' if most == len(CUBE) else f'{WIDE:g} degrees and more'}: each "
+        f"is used as {most} faces of a cube, called {', '.join(called[wide[0]][:2])} and so on"
+    )
+    return replace(
+        capture,
+        photos=sorted(photos, key=lambda photo: photo.name),
+        seen=None if capture.seen is None else seen,
+        test_names=None if tests is None else frozenset(own for name in tests for own in called[name]),
+        near_far={own: depths for name, depths in capture.near_far.items() for own in called[name]},
+        notes=[*capture.notes, note],
+    )

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -19,8 +21,7 @@ from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.threads import one_torch_thread
 from hqgs.base.typed import build
 from hqgs.diagnosis.scene import Diagnosis, Inspector
-from hqgs.evaluation.held_out import HeldOutViews, history_entry
-from hqgs.evaluation.looks import looks_of_devices
+from hqgs.evaluation.held_out import HeldOutViews, history_entry, looks_of_devices
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.geometry import photo_pixels
@@ -28,18 +29,26 @@ from hqgs.scene.scene import Scene, View
 from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.batch import gradients_of_several
-from hqgs.training.config import TrainConfig, TrainingError
+from hqgs.training.config import TrainConfig, TrainingError, config_values
 from hqgs.training.densify import Densifier
 from hqgs.training.forward import Gradients, Step, gradients_of_one
 from hqgs.training.frame import Trainable
 from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, Guard, parameter_fault
-from hqgs.training.length import by_held_photos, by_the_clock, seconds_left
 from hqgs.training.methods.base import Method
 from hqgs.training.overfitting import decay_opacities
 from hqgs.training.plan import PlanRow, RunPlan, StepSeconds, Tried, left_out_of
 from hqgs.training.prepare import Prepared
-from hqgs.training.schedule import FINEST, Decisions, Schedule, StepPlan, learning_rates, on_the_way
-from hqgs.training.settings import config_values
+from hqgs.training.schedule import (
+    CHECKS,
+    COARSE_FACTOR,
+    FINEST,
+    REST,
+    Decisions,
+    Schedule,
+    StepPlan,
+    learning_rates,
+    on_the_way,
+)
 from hqgs.training.state import TrainState
 
 
@@ -390,3 +399,81 @@ def _timed(trainer: Trainer, half_size: bool) -> float:
     for _ in range(7):
         trainer.step(half_size)
     return (trainer.seconds - started) / (trainer.iteration - before)
+
+
+# How long a run is, decided while it trains. A few training photos are held back at first, where it is not
+# known how long a run pays: they tell whether it still improves. Then they come back, early enough that the
+# scene can still grow where only they look. Test views are never looked at. The rest of a run that has so
+# many seconds, after growth, is as long as the clock allows.
+
+# dB and iterations: the run has stopped improving where held-back photos gain no more in so many.
+BETTER, PATIENCE = 0.05, 2_000
+
+
+def by_held_photos(schedule: Schedule, state: TrainState, psnr: Callable[[], float]) -> Decisions:
+    """The decisions after a step: whether held-back photos end the run sooner, or come back.
+
+    `psnr`: of those photos now, dB; NaN where their masks leave nothing. Rows of the state tell it.
+    """
+    decisions, iteration, total = state.decisions, state.iteration, schedule.config.iterations
+    if iteration % CHECKS == 0 and not schedule.is_coarse(iteration) and not math.isnan(now := psnr()):
+        if now > state.best + BETTER:
+            state.best, state.best_at = now, iteration
+        if iteration - state.best_at >= PATIENCE:
+            length = min(total, math.ceil((1 + REST) * iteration))
+            decisions = replace(decisions, length=length, released=iteration)
+            why = "the validation photos stopped improving"
+            told = f"best {state.best:.2f} dB at iteration {state.best_at}, {now:.2f} dB at {iteration}"
+            left = f"iterations {length + 1} to {total}"
+            row = PlanRow("length", f"{length:,} iterations", why, told, "iterations", iteration, left)
+            state.rows.append(row)
+    if iteration == schedule.config.due.stop:
+        decisions = replace(decisions, released=iteration)
+    if decisions.released:
+        why = "the scene needs them where no other photo looks"
+        state.rows.append(
+            PlanRow("validation photos", "trained on from here", why, "", "held_photos", iteration)
+        )
+    return decisions
+
+
+def by_the_clock(
+    schedule: Schedule, decisions: Decisions, iteration: int, seconds: float, step: float
+) -> Decisions:
+    """The decisions after a step: at `Schedule.turn_at` the rest gets the length that the clock allows.
+
+    `seconds`: that the run has taken; `step`: those of a step now. Settings with a `turn` follow that in
+    place of the clock.
+    """
+    config = schedule.config
+    if decisions.turned:
+        return decisions
+    at, most = schedule.turn_at(decisions), schedule.run.clock_most
+    if config.turn is not None:
+        length = config.turn[1]
+    elif most and config.seconds is not None:
+        rest = config.iterations - at
+        left = (config.seconds - seconds) / step if step > 0 else rest
+        length = at + round(min(max(left, 0.1 * rest), 4.0 * rest))
+        length = min(length, most)
+    else:
+        return decisions
+    if iteration != at or not at < min(length, config.iterations) or length == decisions.length == most:
+        return decisions
+    return replace(decisions, length=length, turned=at)
+
+
+def seconds_left(schedule: Schedule, state: TrainState, pixels: float) -> float:
+    """What the steps to come will take, by the last ones: a step takes time for its pixels and its Gaussians,
+    about as much for one as for the other. `pixels`: of a training photo, in the mean.
+    """
+    done, length, count = state.iteration, state.decisions.length, len(state.gaussians)
+    small = pixels / COARSE_FACTOR**2
+    coarse = max(min(schedule.run.half_size_until, length) - done, 0)
+    stop, growth = schedule.densification_end(state.decisions), schedule.config.densify
+    growing = max(stop - done, 0) if schedule.config.due.start < stop else 0
+    # Until growth ends a scene gains about twice its Gaussians: 1.4 to 7.5 times in runs of 1,000.
+    more = min(2 * (growing / max(stop, 1)) ** 2 * count, max(growth.max_gaussians - count, 0))
+    work = coarse * small + (length - done - coarse) * pixels
+    work += count * (length - done) + more * (length - done - growing / 2)
+    return median(state.recent) * work / ((small if coarse else pixels) + count) if state.recent else 0.0
