@@ -17,7 +17,6 @@ from hqgs.cli.errors import fail
 
 T = TypeVar("T")
 MARKERS = (tyro.conf.FlagCreatePairsOff, tyro.conf.AvoidSubcommands)
-DEEP = 8  # columns from the border of tyro's boxes on which an option is explained
 WORDS = {  # tyro's, and ours
     r"Unrecognized options?: (?!-)": "one argument too many: ",
     r"(one argument too many: .*\.(?:jpe?g|png|heic|tiff?|mp4|mov|json|txt)\b.*)": r"\1; give their folder",
@@ -68,7 +67,7 @@ def _sentence(box: str) -> str:
     """What tyro draws as a box, as one line without the options' help."""
     kept = []
     for line in (line.strip("│") for line in box.splitlines()[1:]):
-        if len(line) - len(line.lstrip()) >= DEEP:  # it explains an option
+        if len(line) - len(line.lstrip()) >= 8:  # columns from the border: it explains an option
             continue
         line = line.strip("│╭╮╰╯─ \n").rstrip()
         if line.startswith(("Got errors", "Argument helptext")):

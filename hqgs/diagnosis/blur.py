@@ -25,14 +25,10 @@ HIGHEST = 2.7  # rad/px; above it cameras and resizing leave their own mark
 BLUR_SIGMAS = np.concatenate([np.arange(0, 4, 0.05), 4 * 1.02 ** np.arange(70)])  # px, up to 16
 RADII = np.concatenate([np.arange(1, 8, 0.1), 8 * 1.02 ** np.arange(57)])  # px of the disc, up to 24
 BLUR_LENGTHS = 3 * 1.25 ** np.arange(13)  # px, of the motion
-FINE_LENGTHS = 3 * 1.04 ** np.arange(69)  # px, around the best of them
 ANGLES = np.arange(18) * np.pi / 18  # rad, of the motion
 CLEARLY = 0.7  # a kind other than Gaussian must have less than this share of the Gaussian's misfit
 # Of the log power: how far sharp photos are off the law; as points err together, each tells little.
 RING_ERROR, POINT_ERROR = 0.2, 0.6
-# levels^2: what JPEG of a quality too good to be found may have added; without them a blur of 2 px under
-# quality 95 passes for a disc, one of 1 px under 92 for 0.7 px.
-UNKNOWN_FLOORS = (0.0, 0.1, 0.3, 1.0)
 
 
 def tile_size(grey: Floats) -> int | None:
@@ -154,9 +150,11 @@ def estimate_blur(levels: Floats, noise: float) -> Blur | None:
     if (log_power > np.log(known) + 1).sum() < 3:  # as many as the law and a blur have unknowns
         return None
     blurs = [_round_blurs(kind, sizes, frequency, 2 * np.pi / tile) for kind, sizes in ROUND]
+    # levels^2: what JPEG of a quality too good to be found may have added; without them a blur of 2 px under
+    # quality 95 passes for a disc, one of 1 px under 92 for 0.7 px.
     fits = [
         (*(fit_blurs(frequency, log_power, RING_ERROR, blur, floor) for blur in blurs), floor)
-        for floor in known + np.array(UNKNOWN_FLOORS)
+        for floor in known + np.array([0.0, 0.1, 0.3, 1.0])
     ]
     gaussian, defocus, floor = min(fits, key=lambda fit: min(fit[0].min(), fit[1].min()))
     sigma, radius = float(BLUR_SIGMAS[gaussian.argmin()]), float(RADII[defocus.argmin()])
@@ -193,7 +191,8 @@ def _motion(spectrum: Floats, floor: float, sigma: float, radius: float) -> Blur
     if coarse.min() >= still:
         return None
     angle = float(np.repeat(ANGLES, len(BLUR_LENGTHS))[coarse.argmin()])
-    lengths, angles = (a.ravel() for a in np.meshgrid(FINE_LENGTHS, angle + np.deg2rad([-4.0, 0.0, 4.0])))
+    fine = 3 * 1.04 ** np.arange(69), angle + np.deg2rad([-4.0, 0.0, 4.0])  # px and rad, around the best
+    lengths, angles = (a.ravel() for a in np.meshgrid(*fine))
     moved = fit(_motions(lengths, angles, at, step))
     length = float(lengths[moved.argmin()])
     if moved.min() >= CLEARLY * still:

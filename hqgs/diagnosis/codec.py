@@ -28,7 +28,6 @@ MAGNITUDES = np.array([1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 40, 56, 80, 112, 160, 2
 
 LUMA_709 = np.array([0.2126, 0.7152, 0.0722])  # of films in HD (ITU-R BT.709); LUMA is that of the others
 STEP = 255 / 219  # levels: of the luma of 8 bits from 16 (black) to 235 (white), which films store
-FEWEST_PIXELS, FEWEST_LEVELS = 10, 48  # of each level of the luma that counts, and of these
 
 
 _ROWS, _COLUMNS = np.mgrid[:6, :6]
@@ -269,9 +268,9 @@ def _comb(grey: Floats) -> float:
     """
     level = np.rint(grey.clip(0, 255)).astype(np.int64).ravel()
     pixels = np.bincount(level, minlength=256)
-    told = pixels >= FEWEST_PIXELS
+    told = pixels >= 10  # of each level that counts
     told[[0, -1]] = False  # what is clipped
-    if told.sum() < FEWEST_LEVELS:
+    if told.sum() < 48:  # such levels
         return 0.0
     near = np.bincount(level, np.cos(2 * np.pi / STEP * grey).ravel(), len(pixels))
     return float((near[told] / pixels[told]).mean())

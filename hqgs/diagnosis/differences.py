@@ -28,7 +28,6 @@ CHOICE_SIGMAS = np.arange(-3, 10.01, 0.25)  # px; below 0: sharper than the othe
 
 UNLIKE, TURNED = 0.18, 0.45  # from these values of `unlike_sharpness` on, photos were shaken
 SECTORS = 8  # directions of frequencies
-UNLIKE_COARSE, UNLIKE_FINE = (0.03, 0.1), (0.15, 0.4)  # frequencies, cycles per px
 
 
 Rings = tuple[Floats, Floats]  # as `rings` returns them
@@ -150,7 +149,7 @@ def _directions(photo: NDArray[Any]) -> NDArray[np.float64]:
         sums = np.bincount(sector[chosen], power[chosen], SECTORS)
         return np.log(sums / np.bincount(sector[chosen], minlength=SECTORS).clip(1) + 1e-12)
 
-    return logs(UNLIKE_FINE) - logs(UNLIKE_COARSE)
+    return logs((0.15, 0.4)) - logs((0.03, 0.1))  # of frequencies, cycles per px
 
 
 def shake_finding(scene: Scene) -> Finding:

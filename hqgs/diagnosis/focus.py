@@ -17,7 +17,6 @@ from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Scene, View
 
 Floats = NDArray[np.float64]
-ROUNDS = 30  # of medians of photos and points in turn
 GOES_WITH_DEPTH, DIFFERS = 0.06, 0.4  # from these values of `focus_signs` on, photos differ in focus
 MOST_PHOTOS, FOCUS_MOST_POINTS = 60, 4000  # that are looked at
 # px: sigmas between which details lie, and the window around a point
@@ -91,7 +90,7 @@ def _of_photos(sharp: Floats, depths: Floats) -> tuple[Floats, Floats]:
         squares = np.nansum(near**2, axis=1)
         slope, rest = np.zeros(len(sharp)), np.zeros(len(sharp))
         with_distance = 0.0
-        for _ in range(ROUNDS):
+        for _ in range(30):  # medians of photos and points in turn
             told = sharp - with_distance * farther
             own = np.nanmedian(told - rest[:, None] - slope[:, None] * near, axis=0)
             left = told - own

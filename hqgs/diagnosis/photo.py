@@ -20,7 +20,6 @@ from hqgs.photos.resize import resize_matrix
 from hqgs.scene.constants import SMALLEST_SIDE
 
 FACTORS = (2, 3, 4, 6, 8)  # of enlargement that are tried
-LONGEST = 768  # px of a line that are looked at
 ROUNDING = 0.05  # levels; a residual below this counts as this
 
 
@@ -86,7 +85,7 @@ def _evidence(lines: Floats, small: int, factor: int) -> float:
 @lru_cache(maxsize=32)
 def _basis(small: int, size: int) -> Floats:
     """Orthonormal columns that span the first pixels of enlarged lines, [pixels, small pixels]."""
-    matrix = resize_matrix(small, size)[:LONGEST]
+    matrix = resize_matrix(small, size)[:768]  # px of a line that are looked at
     return np.linalg.qr(matrix[:, matrix.any(axis=0)])[0]
 
 
@@ -95,11 +94,6 @@ def _solve(levels: Floats, small: int) -> Floats:
     matrix = csc_array(resize_matrix(small, len(levels)))
     right = matrix.T @ levels.reshape(len(levels), -1)
     return splu((matrix.T @ matrix).tocsc()).solve(right).reshape(small, *levels.shape[1:])
-
-
-LARGE_PATCH, SMALL_PATCH = 5, 3  # px
-LIMIT, SMALL_LIMIT = 2.5, 4.0  # levels: photos of fine texture without noise reach 1.9, small ones 3.2
-MIN_PATCHES, MAX_PATCHES = 200, 12_000  # that are needed, and that are looked at
 
 
 def estimate_noise(levels: Floats) -> tuple[float, float] | None:
@@ -115,10 +109,11 @@ def estimate_noise(levels: Floats) -> tuple[float, float] | None:
     """
     height, width = levels.shape[:2]
     # below this the large patch has too many directions for the photo
-    size = LARGE_PATCH if height * width >= 4 * 4_000 else SMALL_PATCH
+    # px; and levels: photos of fine texture without noise reach 1.9, small ones 3.2
+    size, limit = (5, 2.5) if height * width >= 4 * 4_000 else (3, 4.0)
     if min(height, width) < size:
         return None
-    step = max(1, int(np.sqrt(height * width / MAX_PATCHES)))
+    step = max(1, int(np.sqrt(height * width / 12_000)))  # patches that are looked at
     patches = np.lib.stride_tricks.sliding_window_view(levels, (size, size), axis=(0, 1))[::step, ::step]
     # px: the photo is cut into a chessboard of tiles of this size
     rows, columns = np.indices(patches.shape[:2]) * step // 24
@@ -126,7 +121,7 @@ def estimate_noise(levels: Floats) -> tuple[float, float] | None:
     vectors = patches.reshape(-1, 3 * size * size)
     clipped = ((vectors == 0) | (vectors == 255)).any(axis=1)
     halves = [vectors[side & ~clipped] for side in (white, ~white)]
-    if min(len(half) for half in halves) < MIN_PATCHES:
+    if min(len(half) for half in halves) < 200:
         return None
     covariances = [np.cov(half.T) for half in halves]
     variances = []
@@ -134,7 +129,7 @@ def estimate_noise(levels: Floats) -> tuple[float, float] | None:
         flattest = np.linalg.eigh(here)[1][:, 0]
         variances.append(flattest @ there @ flattest)
     level = float(np.sqrt(max(np.mean(variances), 0.0)))
-    return level, LIMIT if size == LARGE_PATCH else SMALL_LIMIT
+    return level, limit
 
 
 def neighbour_correlation(levels: Floats) -> float | None:

@@ -30,8 +30,6 @@ from hqgs.photos.formula import DEVICES, KINDS, NONE, parse_formation, within
 from hqgs.scene.scene import Scene, View
 
 SCENE_WHITE = 0.2  # up to this correlation of neighbours, noise counts as white
-# JPEG is undone below the first quality, or below the second where blur, noise or an enlargement is undone.
-BAD_QUALITY, VISIBLE_QUALITY = 25, 85
 # Of `fine_detail`; crf 36 leaves 0.15 to 0.25, crf 28 0.2 to 0.45, sharp photos have 0.3 to 0.5.
 COARSE_FILM = 0.24
 
@@ -205,7 +203,7 @@ def _jpeg(photos: Sequence[PhotoDiagnosis], alone: bool) -> Finding:
         return Finding("jpeg", of)
     quality = float(np.median(qualities))
     spread = _spread_of(qualities)
-    limit = BAD_QUALITY if alone else VISIBLE_QUALITY
+    limit = 25 if alone else 85  # where blur, noise or an enlargement is undone
     if quality >= limit:
         reason = f"quality {quality:.0f} needs no correction (needed below {limit})"
         return Finding("jpeg", reason, None, quality, spread)

@@ -14,8 +14,6 @@ from hqgs._rust import NEAR_PLANE
 from hqgs.photos.resize import Pixels, area_downscale
 from hqgs.scene.scene import Camera, Scene, View
 
-PICTURE_MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
-
 
 def unproject(
     camera: Camera, pixels: NDArray[np.float64], depths: NDArray[np.float64]
@@ -89,11 +87,12 @@ def photo_pixels(means: Tensor, views: list[View]) -> Tensor:
 def in_picture(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """View-space depths [N] of means [N, 3] (float64), and whether they are in the picture, bool [N]."""
     viewmat, K = torch.from_numpy(camera.viewmat), camera.K
+    margin = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
     x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
     seen = (
         (z > NEAR_PLANE)
-        & (x.abs() * K[0, 0] < PICTURE_MARGIN * camera.width / 2 * z)
-        & (y.abs() * K[1, 1] < PICTURE_MARGIN * camera.height / 2 * z)
+        & (x.abs() * K[0, 0] < margin * camera.width / 2 * z)
+        & (y.abs() * K[1, 1] < margin * camera.height / 2 * z)
     )
     return z, seen
 

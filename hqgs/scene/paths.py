@@ -13,8 +13,6 @@ from hqgs.base.evenly import evenly
 from hqgs.scene.constants import PATH_SIZE
 from hqgs.scene.scene import Camera, Scene
 
-LEAP = 10.0  # median steps: south 26, from one side of a house to another; films and walks around up to 7
-
 UP = (0.0, -1.0, 0.0)  # of a scene that says nothing: COLMAP's first camera has y down
 AROUND = math.radians(150)  # cameras that see their focus from a wider range are walked around in a circle
 _Array = NDArray[np.float64]
@@ -136,7 +134,7 @@ def camera_path(
         cameras: at least 1, such as those of the training views.
         frames: how many, at least 1.
         closed: end where it began.
-        cuts: go on at the other side of a leap, LEAP times as long as the walk's usual step, in place of
+        cuts: go on at the other side of a leap, ten times as long as the walk's usual step, in place of
             flying where no camera stood: through walls and trees.
         sort: False: through all of them, in the order given.
 
@@ -288,7 +286,8 @@ def _between_leaps(walk: list[Camera]) -> list[list[Camera]]:
     """The pieces of a walk between leaps; cameras that stand alone there are left out."""
     steps = _lengths(walk)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    ends = [0, *(int(k) + 1 for k in np.flatnonzero(steps > LEAP * usual)), len(walk)]
+    # South has a leap of 26, from one side of a house to another; films and walks around have up to 7.
+    ends = [0, *(int(k) + 1 for k in np.flatnonzero(steps > 10 * usual)), len(walk)]
     pieces = [walk[begin:end] for begin, end in pairwise(ends)]
     return [piece for piece in pieces if _lengths(piece).sum() > 0] or [walk]
 

@@ -18,7 +18,6 @@ from hqgs.scene.georeference import Georeference, georeference
 from hqgs.scene.scene import Camera, strays
 from hqgs.scene.world import world_for
 
-FAR_OFF = 20.0  # median distances: from here on a camera is asked what of the points it shows
 LOOKED_AT = 1000  # points of a scene that tell what a camera shows
 
 
@@ -65,14 +64,14 @@ def without_poseless(root: Path, capture: Capture, notes: list[str]) -> Capture:
 def without_strays(capture: Capture, notes: list[str]) -> Capture:
     """The capture without cameras that lie far from all others and show nothing; `notes` names them.
 
-    A camera over FAR_OFF times as far away as half of them goes if the points are outside of its picture, or
+    A camera over 20 times as far away as half of them goes if the points are outside of its picture, or
     a dot in it: its pose is a mistake of the reconstruction. Without points nothing tells a mistake from a
     walk that leaves a room in which most photos were taken.
     """
     if len(capture.photos) < 4 or not len(capture.points):
         return capture
     points = capture.points[:: max(1, len(capture.points) // LOOKED_AT)].astype(np.float64)
-    far = strays(_centers(capture), FAR_OFF)
+    far = strays(_centers(capture), 20.0)
     away = [photo for photo, off in zip(capture.photos, far, strict=True) if off]
     sure = {photo.path for photo in away if _shows(photo, points)}  # all faces of a photo stay, or none
     gone = {photo.name for photo in away if photo.path not in sure}

@@ -14,8 +14,6 @@ from hqgs.base.text import some
 from hqgs.scene.georeference import Georeference
 from hqgs.scene.world import World
 
-STRAY = 10.0  # median distances from the cameras' middle: one so far off says nothing of a scene's size
-
 
 @dataclass(frozen=True)
 class Camera:
@@ -119,7 +117,7 @@ class Scene:
     def extent(self) -> float:
         """Radius of the camera positions: `1.1 max |c - mean(c)|`, or 1 for a single camera.
 
-        Cameras that lie more than STRAY median distances from the others' middle do not count.
+        Cameras that lie more than ten median distances from the others' middle do not count.
         """
         return extent_of(np.stack([v.camera.center for v in self.train]))
 
@@ -148,7 +146,7 @@ def strays(centers: NDArray[np.float64], most: float) -> NDArray[np.bool_]:
 
 def extent_of(centers: NDArray[np.float64]) -> float:
     """The extent of a scene whose training cameras are at `centers` [C, 3]; see `Scene.extent`."""
-    centers = centers[~strays(centers, STRAY)]
+    centers = centers[~strays(centers, 10.0)]
     radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
     return 1.1 * radius if radius > 0 else 1.0
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from hqgs.scene.constants import OUTLIER, ROUNDING
 
-HYPOTHESES = 100  # choices of two or three that are tried: enough where half of all are wrong
-
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp] | NDArray[np.bool_]
 Fit = TypeVar("Fit")
@@ -53,11 +51,12 @@ def robust(
     off (least median of squares, Rousseeuw 1984); then those within OUTLIER robust standard deviations count,
     until they stay the same.
     """
-    if math.comb(count, least) <= HYPOTHESES:
+    tried = 100  # choices of two or three: enough where half of all are wrong
+    if math.comb(count, least) <= tried:
         choices = [np.array(rows) for rows in combinations(range(count), least)]
     else:
         rng = np.random.default_rng(0)
-        choices = [rng.choice(count, least, replace=False) for _ in range(HYPOTHESES)]
+        choices = [rng.choice(count, least, replace=False) for _ in range(tried)]
     found = [one for rows in choices if (one := fit(rows)) is not None]
     if not found:
         return None

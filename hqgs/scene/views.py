@@ -33,7 +33,6 @@ from hqgs.scene.faces import AROUND, CUBE, Face, faces_of, lit, projected
 from hqgs.scene.geometry import parts_of
 from hqgs.scene.scene import Camera, View
 
-DENSER = 2.0  # new pixels a wanted one, along each side, at which a photo is undistorted
 # px of such a grid: positions are computed so far apart; px: where that is exact enough, and a camera that is
 # no farther from a pinhole is one, its photo not resampled.
 LATTICE, EXACT = 8, 0.02
@@ -76,7 +75,8 @@ def load_views(
         model, params, camera_width, camera_height, width, height, name = key
         camera = pycolmap.Camera(model=model, params=params, width=camera_width, height=camera_height)
         face = next((face for face in faces_of(camera) if face.name == name), None)
-        return to_pinhole(camera, width, height, max(downscale / DENSER, 1.0), face)
+        # With two new pixels for a wanted one along each side.
+        return to_pinhole(camera, width, height, max(downscale / 2.0, 1.0), face)
 
     locks: defaultdict[_CameraKey, Lock] = defaultdict(Lock)
 

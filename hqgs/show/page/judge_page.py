@@ -29,8 +29,6 @@ from hqgs.photos.pixels import png, upright
 from hqgs.show.page.page import filled, pair
 from hqgs.show.trust import WORST_SHOWN
 
-COLORS = ("#d0672a", "#8a5fbf", "#7a7a7a", "#b8c4d0", "#c9b458", "#2f7fc4", "#3f9b57")
-
 
 def judge_page(found: dict[str, Any], judged: HeldOutViews) -> str:
     """The page as HTML: `found` is what judge.json holds, `judged` the photos and renders of the scene.
@@ -39,6 +37,7 @@ def judge_page(found: dict[str, Any], judged: HeldOutViews) -> str:
     """
     one, against, protocol = found["scene"], found.get("against"), found["protocol"]
     shown = [name for name in LABELS if one["mean"][name] is not None]
+    colors = ("#d0672a", "#8a5fbf", "#7a7a7a", "#b8c4d0", "#c9b458", "#2f7fc4", "#3f9b57")
     order = sorted(one["views"], key=lambda name: one["views"][name]["psnr"] or np.inf)
     chosen = [judged.names.index(name) for name in order[:12]]
     names = (Path(one["name"]).name, None) if against is None else short_names(one, against)
@@ -61,7 +60,7 @@ def judge_page(found: dict[str, Any], judged: HeldOutViews) -> str:
                 "percent": round(100 * share, 1),
                 "color": color,
             }
-            for (part, share), color in zip(one["causes"].items(), COLORS, strict=True)
+            for (part, share), color in zip(one["causes"].items(), colors, strict=True)
         ],
         patch=PATCH,
         white=int(WORST_SHOWN),

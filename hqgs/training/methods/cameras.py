@@ -89,18 +89,9 @@ class _TakePhoto(torch.autograd.Function):
         )
 
 
-# Shares of the run before which trajectories would hide what the scene does not show yet, at which short ones
-# are given up, and of the rates at the end.
-CAMERAS_BEGIN, GIVE_UP_AT, CAMERA_RATES_LEFT = 0.1, (0.5, 0.75), 0.1
 SHORTEST_TRAJECTORY = 0.7  # px, of the picture's middle, and the widest disc: a photo with less is sharp
-FIRST_TRAJECTORY = 1e-3  # of the photo's width, standard deviation: from 0 it has no direction to grow in
 TRAJECTORY_POINTS = 9  # that stand for a trajectory
-MOST_MARGIN = 48  # px around a render
-MEAN_SQUARES = 1 / 3, 0.16  # of r^2 and r^4 over a picture, the latter 0.156 (a square) to 0.168 (16:9)
-KEPT = 8  # maps of squared radii; photos may each have a camera of their own
-FIRST_RADIUS = 0.0015  # of the photo's width: from 0 it has no direction to grow in
 LENS_NEAREST, LENS_FARTHEST = 2.0, 0.3  # nearness of what photos show, as far as sizes of discs go
-FEWEST_SAMPLES, MOST_SAMPLES = 6, 24  # of the aperture
 
 
 @dataclass(frozen=True)
@@ -169,7 +160,8 @@ class LearnedCameras:
         self._widths = [max(view.camera.width, 200) for view in views]
         self._sizes = [(view.camera.height, view.camera.width) for view in views]
         rng, count = np.random.default_rng([seed, 6]), len(views)
-        first = FIRST_TRAJECTORY * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
+        # In widths of the photo: from 0 a trajectory has no direction to grow in, nor has a lens.
+        first = 1e-3 * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
         self._paths = [
             torch.from_numpy(path * width).requires_grad_()
             for path, width in zip(first if shake else [], self._widths, strict=False)
@@ -180,7 +172,7 @@ class LearnedCameras:
         ]
         self._mean = torch.stack([gains.detach() for gains in self._gains] or [torch.zeros(3)]).mean(0)
         self._lenses = [  # all of the photo out of focus alike, by little
-            torch.tensor([0.0, FIRST_RADIUS * width], dtype=torch.float64, requires_grad=True)
+            torch.tensor([0.0, 0.0015 * width], dtype=torch.float64, requires_grad=True)
             for width in (self._widths if focus else [])
         ]
         self._nearness: list[Tensor | None] = [None] * count
@@ -193,8 +185,8 @@ class LearnedCameras:
 
     def schedule(self, iterations: int) -> None:
         """Of a run of this length."""
-        self._begin = round(CAMERAS_BEGIN * iterations)
-        self._looks = (round(GIVE_UP_AT[0] * iterations), round(GIVE_UP_AT[1] * iterations))
+        self._begin = round(0.1 * iterations)  # before, trajectories would hide what the scene does not show
+        self._looks = round(0.5 * iterations), round(0.75 * iterations)  # at which short ones are given up
 
     def shot(self, view: View, photo: Tensor) -> Shot:
         """Of a training view."""
@@ -207,7 +199,7 @@ class LearnedCameras:
         if blurs:
             warps = self._warps(number, camera)
             reach = float(_moved(warps.detach(), camera, nearness=2.0).abs().max())
-            margin = min(4 * math.ceil((reach + 1) / 4), MOST_MARGIN)
+            margin = min(4 * math.ceil((reach + 1) / 4), 48)
         K = camera.K.copy()
         K[:2, 2] += margin
         wide = Camera(camera.width + 2 * margin, camera.height + 2 * margin, K, camera.viewmat)
@@ -273,12 +265,12 @@ class LearnedCameras:
         ]
 
     def rates(self, part: float) -> dict[str, float]:
-        """Learning rates after this part of the run."""
+        """Learning rates after this part of the run; at its end they are a tenth of the first."""
         width, trained = float(np.mean(self._widths)), {group["name"] for group in self.param_groups()}
         first = {"paths": 8e-4 * width, "lenses": 4e-4 * width, "gains": 0.005}
         # which each photo of a camera moves; a scene takes over some of its lenses' fall where it can
         first |= {"vignetting": 0.0003, "response": 0.001}
-        return {name: rate * CAMERA_RATES_LEFT**part for name, rate in first.items() if name in trained}
+        return {name: rate * 0.1**part for name, rate in first.items() if name in trained}
 
     def state_dict(self) -> dict[str, Tensor]:
         state = {"visits": self._visits, "still": self._still, "sharp": self._sharp}
@@ -410,14 +402,15 @@ class LearnedDevices:
         counts = np.bincount(first.of_photo[first.of_photo >= 0], minlength=len(first))
         self._shares = torch.from_numpy(counts / max(counts.sum(), 1))
         self._told = counts.sum() / max(len(first.of_photo), 1)  # share of the photos that have a camera
-        self._squares = lru_cache(KEPT)(_squares)
+        self._squares = lru_cache(8)(_squares)  # photos may each have a camera of their own
         self.center()
 
     def level(self) -> Tensor:
         """The mean of the logarithm of what lenses keep from photos: gains beside it leave their mean."""
         if not self._vignetting:
             return torch.zeros((), dtype=torch.float64)
-        means = torch.stack([*self._vignetting]) @ torch.tensor(MEAN_SQUARES, dtype=torch.float64)
+        # Means of r^2 and r^4 over a picture, the latter 0.156 (a square) to 0.168 (16:9).
+        means = torch.stack([*self._vignetting]) @ torch.tensor([1 / 3, 0.16], dtype=torch.float64)
         return self._told * (self._shares * means).sum()
 
     def develop(self, number: int, camera: Camera, taken: Tensor) -> Tensor:
@@ -486,7 +479,7 @@ def sharp_at(slope: float, offset: float) -> float | None:
 
 def samples(lens: Tensor) -> int:
     """How many points of the lens stand for all of it: one for 2.5 px of the largest disc."""
-    return min(max(FEWEST_SAMPLES, math.ceil(math.pi * widest(*lens.tolist()) ** 2 / 2.5)), MOST_SAMPLES)
+    return min(max(6, math.ceil(math.pi * widest(*lens.tolist()) ** 2 / 2.5)), 24)
 
 
 def lens_warps(lens: Tensor, count: int) -> Tensor:
