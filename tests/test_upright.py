@@ -21,7 +21,7 @@ from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.sfm.align import Similarity, align, camera_centers, refine, rotation_angles
 from hqgs.scene.sfm.refine.tracks import Tracks
 from hqgs.scene.source import load
-from hqgs.scene.upright import as_asked, direction_of, with_up
+from hqgs.scene.upright import direction_of, told_up, with_up
 
 TURN = Rotation.from_euler("xyz", [30, 50, 70], degrees=True).as_matrix()
 UP = TURN @ [0, -1, 0]
@@ -88,7 +88,7 @@ def test_gps_tells_up_where_it_is_sure(room: Scene) -> None:
 
 
 def test_up_as_it_was_asked_for(room: Scene) -> None:
-    asked = as_asked(room, direction_of((0, 0, -2)))
+    asked = told_up(room, direction_of((0, 0, -2)), "as given")
     assert asked.world.up == (0, 0, -1)
     np.testing.assert_allclose(scene_up(asked), [0, 0, -1])
     assert asked.notes[-1] == "up is (0.000, 0.000, -1.000), as given"

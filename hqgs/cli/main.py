@@ -14,37 +14,26 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from io import TextIOWrapper
-from typing import NamedTuple, TextIO
+from typing import TextIO
 
 from hqgs import __version__
 from hqgs.cli.errors import BAD_INPUT, fail
 
-
-class Command(NamedTuple):
-    """A command: its module has `OPTIONS`, a dataclass, and `run`, which takes one and gives an exit code.
-
-    It may have `read` in place of `hqgs.cli.parse.parse`.
-    """
-
-    module: str
-    about: str
-
-
+# A command's module, and what it is about. The module has `OPTIONS`, a dataclass, and `run`, which takes one
+# and gives an exit code; it may have `read` in place of `hqgs.cli.parse.parse`.
 COMMANDS = {
-    "train": Command("hqgs.cli.train", "make a scene and a report from photos or a film"),
-    "sfm": Command("hqgs.cli.sfm", "find cameras and points of photos or a film (COLMAP)"),
-    "judge": Command(
-        "hqgs.cli.judge", "measure how good a run or a scene file is, and what causes its errors"
-    ),
-    "eval": Command("hqgs.cli.judge", "the same as judge"),
-    "render": Command("hqgs.cli.render", "make pictures and films of a scene"),
-    "view": Command("hqgs.cli.view", "show a scene in a browser (train --view: while it trains)"),
-    "export": Command("hqgs.cli.export", "write a smaller scene file, or another format"),
-    "plan": Command("hqgs.cli.plan", "print the settings that a run would use, and why, without training"),
-    "clean": Command("hqgs.cli.clean", "remove floaters from a scene file"),
-    "diagnose": Command("hqgs.cli.diagnose", "measure blur, noise, JPEG compression and exposure of photos"),
-    "degrade": Command("hqgs.cli.degrade", "write a scene with degraded training photos"),
-    "info": Command("hqgs.cli.info", "print what a run, a scene file or a folder of photos holds"),
+    "train": ("hqgs.cli.train", "make a scene and a report from photos or a film"),
+    "sfm": ("hqgs.cli.sfm", "find cameras and points of photos or a film (COLMAP)"),
+    "judge": ("hqgs.cli.judge", "measure how good a run or a scene file is, and what causes its errors"),
+    "eval": ("hqgs.cli.judge", "the same as judge"),
+    "render": ("hqgs.cli.render", "make pictures and films of a scene"),
+    "view": ("hqgs.cli.view", "show a scene in a browser (train --view: while it trains)"),
+    "export": ("hqgs.cli.export", "write a smaller scene file, or another format"),
+    "plan": ("hqgs.cli.plan", "print the settings that a run would use, and why, without training"),
+    "clean": ("hqgs.cli.clean", "remove floaters from a scene file"),
+    "diagnose": ("hqgs.cli.diagnose", "measure blur, noise, JPEG compression and exposure of photos"),
+    "degrade": ("hqgs.cli.degrade", "write a scene with degraded training photos"),
+    "info": ("hqgs.cli.info", "print what a run, a scene file or a folder of photos holds"),
 }
 
 
@@ -95,8 +84,9 @@ def command(argv: Sequence[str] | None) -> int:
     try:
         from hqgs.cli.parse import parse  # here: only a command waits for the parser
 
-        module = import_module(COMMANDS[name].module)
-        options = getattr(module, "read", parse)(module.OPTIONS, name, COMMANDS[name].about, rest)
+        place, about = COMMANDS[name]
+        module = import_module(place)
+        options = getattr(module, "read", parse)(module.OPTIONS, name, about, rest)
         return module.run(options)
     except KeyboardInterrupt:
         return fail(130, "stopped")
@@ -112,7 +102,7 @@ def command(argv: Sequence[str] | None) -> int:
 def overview() -> str:
     """What `hqgs --help` says."""
     width = max(map(len, COMMANDS))
-    commands = [f"  {name:{width}}  {command.about}" for name, command in COMMANDS.items()]
+    commands = [f"  {name:{width}}  {about}" for name, (_, about) in COMMANDS.items()]
     return "\n".join(
         [
             "usage: hqgs COMMAND ...",

@@ -56,7 +56,8 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
     most = len(scene.train) - max(3, (len(scene.train) + 1) // 2)
     if most <= 0:
         return scene, []
-    bad = [_bad_values(view) for view in scene.train]
+    photos = ([p for p in (v.image, v.low) if p is not None and p.dtype != np.uint8] for v in scene.train)
+    bad = [sum(int((~np.isfinite(photo)).sum()) for photo in of_view) for of_view in photos]
     drops = [
         _drop(view, "NaN or Inf in its pixels", f"{count} of {view.image.size} values")
         for view, count in zip(scene.train, bad, strict=True)
@@ -78,11 +79,6 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
 
 def _drop(view: View, why: str, evidence: str) -> Drop:
     return view, LeftOut(f"{PHOTO}{view.name}", why, evidence)
-
-
-def _bad_values(view: View) -> int:
-    photos = (view.image, view.low)
-    return sum(int((~np.isfinite(p)).sum()) for p in photos if p is not None and p.dtype != np.uint8)
 
 
 def _needless(views: list[View], points: NDArray[np.float32], notes: list[str]) -> list[Drop]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 from hqgs.evaluation.constants import CONFIDENCE
 
@@ -54,21 +54,10 @@ def _expected(usual: float, deviation: float, count: int) -> float:
     return high
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Of a metric between two scenes on the same photos, photo by photo."""
-
-    mean: float  # the one's less the other's
-    half_width: float | None  # None of a single photo
-
-    @property
-    def sure(self) -> bool:
-        """Whether the interval leaves 0 out."""
-        return self.half_width is not None and abs(self.mean) > self.half_width
-
-
-def difference(one: Sequence[float | None], other: Sequence[float | None]) -> Difference | None:
-    """Paired: narrower than two intervals, as hard photos are hard for both. None where a value is None."""
+def difference(one: Sequence[float | None], other: Sequence[float | None]) -> dict[str, Any] | None:
+    """Of a metric between two scenes on the same photos, JSON values: `mean`, of the one's less the other's,
+    half its `interval` (None of a single photo), and whether that leaves 0 out: `sure`. Paired: narrower than
+    two intervals, as hard photos are hard for both. None where a value is None."""
     pairs = [(a, b) for a, b in zip(one, other, strict=True) if a is not None and b is not None]
     if not pairs or len(pairs) < len(one):
         return None
@@ -76,7 +65,8 @@ def difference(one: Sequence[float | None], other: Sequence[float | None]) -> Di
     import numpy as np
 
     apart = [a - b for a, b in pairs]
-    return Difference(float(np.mean(apart)), half_width(apart))
+    mean, half = float(np.mean(apart)), half_width(apart)
+    return {"mean": mean, "interval": half, "sure": half is not None and abs(mean) > half}
 
 
 def half_widths(views: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> dict[str, float | None]:

@@ -133,11 +133,7 @@ def compared(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for metric in METRICS:
         values = [[view[metric] for view in of["views"].values()] for of in (one, other)]
-        apart = difference(*values)
-        known = (
-            None if apart is None else {"mean": apart.mean, "interval": apart.half_width, "sure": apart.sure}
-        )
-        found[metric] = known
+        found[metric] = difference(*values)
     return found
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, TypeAlias, Union
 
 import numpy as np
 import torch
@@ -24,23 +24,6 @@ from hqgs.photos.resize import resize_matrix
 Taps = tuple[tuple[int, int, float], ...]
 GOLDEN = math.pi * (3 - math.sqrt(5))  # radians from one seed of a sunflower, which fills a disc, to the next
 KERNEL_REACH = 4  # sigmas at which the Gaussian kernel ends
-
-
-class Operator(Protocol):
-    """A linear map of pictures, [H, W, C] to [h, w, C]."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width of what comes out."""
-        ...
-
-    def __call__(self, image: Tensor) -> Tensor:
-        """Differentiable once in the image."""
-        ...
-
-    def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """[h, w], True where no pixel that is left out, in `mask` [H, W], has a weight."""
-        ...
 
 
 class Separable:
@@ -185,7 +168,7 @@ class _ApplyKernel(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class Sequence:
-    """Operators one after the other."""
+    """Operators one after the other, each a linear map of pictures, [H, W, C] to [h, w, C]."""
 
     operators: tuple[Operator, ...]  # at least one
 
@@ -202,6 +185,9 @@ class Sequence:
         for operator in self.operators:
             mask = operator.mask(mask)
         return mask
+
+
+Operator: TypeAlias = Union[Separable, Kernel, Sequence]  # noqa: UP007
 
 
 def formation(

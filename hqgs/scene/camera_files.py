@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from hqgs.photos.video import FPS
 from hqgs.scene.constants import BACKGROUND, KEPT_SIDE
 from hqgs.scene.named_split import names_by_any
 from hqgs.scene.paths import scene_up, view_matrix
-from hqgs.scene.scene import Camera, Scene
+from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.world import World
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes (y up, z back) to OpenCV's
@@ -128,12 +128,7 @@ def load_cameras(folder: str | Path) -> RunCameras:
     return RunCameras(up / np.linalg.norm(up), views, background, world)
 
 
-class _HasName(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-N = TypeVar("N", bound=_HasName)
+N = TypeVar("N", KnownCamera, View)
 
 
 def picked(train: Sequence[N], test: Sequence[N], which: str, whose: str) -> list[N]:

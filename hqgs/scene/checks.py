@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 from hqgs.base.text import some
 from hqgs.photos.suffixes import PHOTO_SUFFIXES, RAW_SUFFIXES
@@ -18,24 +17,18 @@ from hqgs.scene.photo_files import is_run
 CAMERAS = (SINGLE, TRAIN, POSES)
 
 
-class Check(NamedTuple):
-    """Files that are told by their names, and what to do about them."""
-
-    names: re.Pattern[str]
-    advice: str
-
-
 def _ending(suffixes: tuple[str, ...]) -> re.Pattern[str]:
     return re.compile(f".*({'|'.join(map(re.escape, suffixes))})", re.IGNORECASE)
 
 
+# Files that are told by their names, and what to do about them.
 BESIDE = (  # photos
-    Check(_ending(FILM_SUFFIXES), "not read beside photos; to use a film, give it instead of the folder"),
-    Check(
+    (_ending(FILM_SUFFIXES), "not read beside photos; to use a film, give it instead of the folder"),
+    (
         _ending((".icloud", ".crdownload", ".part", ".partial", ".download")),
         "not fully downloaded: download it first",
     ),
-    Check(
+    (
         re.compile(
             r".*(camera|cams|pose|traj|groundtruth|registration|bundle|reconstruction|sfm|transforms|mesh_info)"
             r".*\.(xml|csv|out|json|txt|log|bin|np[yz])|.*\.(psx|rcproj|nvm|mg)",
@@ -45,16 +38,16 @@ BESIDE = (  # photos
     ),
 )
 IN_PLACE = (  # of photos
-    Check(_ending(RAW_SUFFIXES), "raw photos: develop them to JPEG, all with the same settings"),
-    Check(_ending(ARCHIVE_SUFFIXES), "unpack it, and give the folder with the photos"),
-    Check(_ending(FILM_SUFFIXES), "several films: give one of them instead of the folder"),
+    (_ending(RAW_SUFFIXES), "raw photos: develop them to JPEG, all with the same settings"),
+    (_ending(ARCHIVE_SUFFIXES), "unpack it, and give the folder with the photos"),
+    (_ending(FILM_SUFFIXES), "several films: give one of them instead of the folder"),
 )
 
 
 def beside(*folders: Path) -> list[str]:
     """What lies beside photos and is not read, a sentence for each kind."""
     names = sorted({path.name for folder in folders for path in folder.iterdir()})
-    found = ((check.advice, [name for name in names if check.names.fullmatch(name)]) for check in BESIDE)
+    found = ((advice, [name for name in names if named.fullmatch(name)]) for named, advice in BESIDE)
     return [f"{some(files)}: {advice}" for advice, files in found if files]
 
 
@@ -85,9 +78,9 @@ def nothing(root: Path) -> str:
     if is_run(root):
         return f"{root} is the folder of a run that hqgs wrote: give the folder with the photos"
     entries = sorted(p.name for p in root.iterdir() if not p.name.startswith("."))
-    for check in IN_PLACE:
-        if found := [name for name in entries if check.names.fullmatch(name)]:
-            return f"{root} holds no photos, but {some(found)}: {check.advice}"
+    for named, advice in IN_PLACE:
+        if found := [name for name in entries if named.fullmatch(name)]:
+            return f"{root} holds no photos, but {some(found)}: {advice}"
     return (
         f"{root} holds no photos ({', '.join(PHOTO_SUFFIXES)}), here or in a folder further down, and no "
         f"scene (a COLMAP model, {SINGLE}, {TRAIN} or {POSES}); it holds {some(entries)}{perhaps(root)}"

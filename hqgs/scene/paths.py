@@ -142,7 +142,11 @@ def camera_path(
         ValueError: no camera, or no frame.
     """
     _check(cameras, frames)
-    walk = _walk([*cameras]) if sort else [*cameras]
+    walk = [*cameras]
+    if sort:  # in the order of a walk; of very many, every so manieth
+        walk = [walk[k] for k in evenly(len(walk), 400)]
+        tour = [walk[k] for k in _short_walk(np.stack([camera.center for camera in walk]))]
+        walk = walk if _lengths(walk).sum() <= 1.5 * _lengths(tour).sum() else tour
     pieces = _between_leaps(walk) if cuts else [walk]
     ways = np.array([_lengths(piece).sum() for piece in pieces])
     shares = ways / ways.sum() if len(pieces) > 1 else np.ones(1)
@@ -268,13 +272,6 @@ def _range(flat: _Array, up: _Array) -> float:
     angles = np.sort(np.arctan2(flat @ np.cross(up, side), flat @ side))
     gaps = np.diff(np.concatenate([angles, angles[:1] + 2 * math.pi]))
     return float(2 * math.pi - gaps.max())
-
-
-def _walk(cameras: list[Camera]) -> list[Camera]:
-    """The cameras in the order of a walk; of very many, every so manieth."""
-    own = [cameras[k] for k in evenly(len(cameras), 400)]
-    tour = [own[k] for k in _short_walk(np.stack([camera.center for camera in own]))]
-    return own if _lengths(own).sum() <= 1.5 * _lengths(tour).sum() else tour
 
 
 def _lengths(walk: list[Camera]) -> _Array:

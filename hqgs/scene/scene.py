@@ -119,7 +119,10 @@ class Scene:
 
         Cameras that lie more than ten median distances from the others' middle do not count.
         """
-        return extent_of(np.stack([v.camera.center for v in self.train]))
+        centers = np.stack([v.camera.center for v in self.train])
+        centers = centers[~strays(centers, 10.0)]
+        radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+        return 1.1 * radius if radius > 0 else 1.0
 
     @property
     def reach(self) -> float:
@@ -142,13 +145,6 @@ def strays(centers: NDArray[np.float64], most: float) -> NDArray[np.bool_]:
     apart = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     usual = float(np.median(apart))
     return apart > most * usual if usual > 0 else np.zeros(len(centers), np.bool_)
-
-
-def extent_of(centers: NDArray[np.float64]) -> float:
-    """The extent of a scene whose training cameras are at `centers` [C, 3]; see `Scene.extent`."""
-    centers = centers[~strays(centers, 10.0)]
-    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
-    return 1.1 * radius if radius > 0 else 1.0
 
 
 @dataclass(frozen=True)

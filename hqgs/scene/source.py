@@ -30,7 +30,7 @@ from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.room import embedded_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
-from hqgs.scene.upright import as_asked, direction_of, with_up
+from hqgs.scene.upright import direction_of, told_up, with_up
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +113,7 @@ def load_as(
         scene = with_points(scene, models, on_stage)
         scene = scene if named or up is not None else with_up(scene)
     scene = scene if apart is None else in_metres(scene, apart)
-    scene = scene if up is None else as_asked(scene, up)
+    scene = scene if up is None else told_up(scene, up, "as given")
     kept_as = {option.name: getattr(asked, option.name) for option in fields(LoadOptions)}
     kept_as |= {} if asked.restore is None else {"restore": str(Path(asked.restore).resolve())}
     return replace(scene, origin=json.loads(json.dumps(kept_as)))

@@ -51,11 +51,6 @@ def direction_of(up: Sequence[float]) -> Floats:
     return given / length
 
 
-def as_asked(scene: Scene, up: Floats) -> Scene:
-    """The scene with `up` as `direction_of` has it, and a note."""
-    return _told(scene, up, "as given")
-
-
 def with_up(scene: Scene) -> Scene:
     """The scene with up as edges or GPS tell it, in this order; a note says which.
 
@@ -74,10 +69,11 @@ def with_up(scene: Scene) -> Scene:
         f"by {found.said}: 95 % of it within {found.error:.2g} degrees, "
         f"and {moved:.2g} degrees from how the photos were held"
     )
-    return _told(scene, found.direction, why)
+    return told_up(scene, found.direction, why)
 
 
-def _told(scene: Scene, up: Floats, why: str) -> Scene:
+def told_up(scene: Scene, up: Floats, why: str) -> Scene:
+    """The scene with `up`, unit, and a note that says why."""
     x, y, z = up.tolist()
     note = f"up is ({x:.3f}, {y:.3f}, {z:.3f}), {why}"
     return replace(scene, world=replace(scene.world, up=(x, y, z)), notes=[*scene.notes, note])

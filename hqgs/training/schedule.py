@@ -78,7 +78,7 @@ class Schedule:
         """What step number `iteration` (1, 2, ...) does."""
         config, before = self.config, iteration - 1
         due, stop = config.due, self.densification_end(decisions)
-        coarse, part = self.is_coarse(iteration), self.part(iteration, decisions)
+        coarse, part = iteration <= self.run.half_size_until, self.part(iteration, decisions)
         finest = FINEST * (COARSE_FACTOR if coarse else 1) if "growth" in config.leave_out else None
         return StepPlan(
             iteration=iteration,
@@ -163,10 +163,6 @@ class Schedule:
         if decisions.length == self.config.iterations or decisions.turned:
             return stop
         return min(stop, math.ceil((1 + REST / 2) * decisions.released))
-
-    def is_coarse(self, iteration: int) -> bool:
-        """Whether a step is at the smaller size."""
-        return iteration <= self.run.half_size_until
 
 
 def learning_rates(

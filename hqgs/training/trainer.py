@@ -349,7 +349,7 @@ class Trainer:
 
     def _psnr_of_held(self) -> float:
         """Of the training photos that are held back, as the method compares them."""
-        degree, coarse = self.schedule.degree(self.iteration), self.schedule.is_coarse(self.iteration)
+        degree, coarse = self.schedule.degree(self.iteration), self.iteration <= self.plan.half_size_until
         numbers, views = self.schedule.held, self.prepared.training_views
         return views.psnr(self.shown(), numbers, degree, coarse, self.ranks)
 
@@ -416,7 +416,8 @@ def by_held_photos(schedule: Schedule, state: TrainState, psnr: Callable[[], flo
     `psnr`: of those photos now, dB; NaN where their masks leave nothing. Rows of the state tell it.
     """
     decisions, iteration, total = state.decisions, state.iteration, schedule.config.iterations
-    if iteration % CHECKS == 0 and not schedule.is_coarse(iteration) and not math.isnan(now := psnr()):
+    small = iteration <= schedule.run.half_size_until
+    if iteration % CHECKS == 0 and not small and not math.isnan(now := psnr()):
         if now > state.best + BETTER:
             state.best, state.best_at = now, iteration
         if iteration - state.best_at >= PATIENCE:
