@@ -29,7 +29,7 @@ from hqgs.training.methods.paper import (
     ESFG,
     SCS_CACHE_BYTES,
     PaperHQGS,
-    edge_aware_map,
+    edge_magnitude,
     scs_loss,
     scs_weights,
 )
@@ -106,7 +106,7 @@ def test_tokens_are_runs_of_averaged_pixels(monkeypatch: pytest.MonkeyPatch) -> 
     esfg = ESFG([view(image)], 0)
     for tokens, photo in (
         (esfg.photo_tokens, image / 255),
-        (esfg.edge_tokens, edge_aware_map(torch.from_numpy(image)).numpy()),
+        (esfg.edge_tokens, edge_magnitude(torch.from_numpy(image)).numpy() * (image / np.float32(255))),
     ):
         blocks = photo.reshape(4, 2, 6, 2, 3).mean(axis=(1, 3))  # 24 pixels for 12 tokens
         np.testing.assert_allclose(tokens, blocks.reshape(12, 2, 3).mean(axis=1), atol=1e-6)

@@ -29,11 +29,11 @@ from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_fo
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.geometry import in_frame
+from hqgs.scene.known_points import with_first_points
 from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.names import existing_folder
 from hqgs.scene.options import LoadOptions
 from hqgs.scene.place import cut_outs, located, placed, without_missing, without_poseless, without_strays
-from hqgs.scene.random_points import with_first_points
 from hqgs.scene.scene import Camera, Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import Search, read_photos

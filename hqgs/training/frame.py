@@ -20,7 +20,7 @@ from hqgs.model.formats.turned import mapped
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.axes import unseen
 from hqgs.scene.constants import USUAL
-from hqgs.scene.random_points import with_first_points
+from hqgs.scene.known_points import with_first_points
 from hqgs.scene.scene import Scene, View
 from hqgs.scene.world import World, middle_and_size
 

@@ -197,7 +197,8 @@ def _tokens(views: Sequence[View], count: int) -> tuple[Tensor, Tensor]:
     runs: tuple[list[Tensor], list[Tensor]] = ([], [])
     for view in views:
         photo, mask = photo_tensors(view)
-        for image, found in zip((floats(photo), edge_aware_map(photo, mask)), runs, strict=True):
+        edges = edge_magnitude(photo, mask) * floats(photo)  # E = g * I: bright where the photo has edges
+        for image, found in zip((floats(photo), edges), runs, strict=True):
             pixels = _downscaled(image, mask)
             if pixels.shape[1]:
                 found.append(functional.adaptive_avg_pool1d(pixels, count))
@@ -263,14 +264,6 @@ def edge_magnitude(image: Tensor, mask: Tensor | None = None) -> Tensor:
     # A pixel outside the mask may lie outside the range; it gets 0 below.
     g = (magnitude - low) / (high - low)
     return (g if inside is None else torch.where(inside[..., None], g, 0.0)).contiguous()
-
-
-def edge_aware_map(image: Tensor, mask: Tensor | None = None) -> Tensor:
-    """E = g * I [H, W, C] (HQGS, equation of the edge-aware map): bright where the photo has edges.
-
-    Arguments and errors are those of `edge_magnitude`; a uint8 image counts as image / 255.
-    """
-    return edge_magnitude(image, mask) * _checked(image, mask)
 
 
 def _checked(image: Tensor, mask: Tensor | None) -> Tensor:
