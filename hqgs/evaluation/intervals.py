@@ -14,9 +14,10 @@ from typing import Any
 
 from hqgs.evaluation.constants import CONFIDENCE
 
-# The deviation of photos' values within a scene, its median over nine captures: what a few photos that happen
-# to agree are held against.
+# The deviation of photos' values within a scene, its median over nine captures, and the deviation of its log
+# between them: what a few photos that happen to agree are held against.
 SPREADS = {"psnr": 2.0, "psnr_aligned": 2.0, "ssim": 0.025, "haarpsi": 0.04}
+SPREAD_LOGS = 0.7
 
 
 def half_width(values: Sequence[float | None], metric: str | None = None) -> float | None:
@@ -43,7 +44,7 @@ def _expected(usual: float, deviation: float, count: int) -> float:
     from scipy.special import erf
 
     away = np.linspace(-4, 4, 161)
-    sigmas = usual * np.exp(0.7 * away)  # the deviation of that log between captures
+    sigmas = usual * np.exp(SPREAD_LOGS * away)
     logs = -(count - 1) * (np.log(sigmas) + (deviation / sigmas) ** 2 / 2) - away**2 / 2
     weights = np.exp(logs - logs.max())
     low, high = 0.0, 10 * float(sigmas[-1])

@@ -91,6 +91,7 @@ class _TakePhoto(torch.autograd.Function):
 
 SHORTEST_TRAJECTORY = 0.7  # px, of the picture's middle, and the widest disc: a photo with less is sharp
 TRAJECTORY_POINTS = 9  # that stand for a trajectory
+KEPT = 8  # maps of squared radii; photos may each have a camera of their own
 LENS_NEAREST, LENS_FARTHEST = 2.0, 0.3  # nearness of what photos show, as far as sizes of discs go
 
 
@@ -402,7 +403,7 @@ class LearnedDevices:
         counts = np.bincount(first.of_photo[first.of_photo >= 0], minlength=len(first))
         self._shares = torch.from_numpy(counts / max(counts.sum(), 1))
         self._told = counts.sum() / max(len(first.of_photo), 1)  # share of the photos that have a camera
-        self._squares = lru_cache(8)(_squares)  # photos may each have a camera of their own
+        self._squares = lru_cache(KEPT)(_squares)
         self.center()
 
     def level(self) -> Tensor:

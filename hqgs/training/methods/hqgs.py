@@ -30,6 +30,7 @@ from hqgs.training.state import TrainState
 # Standard deviations of the noise up to which differences count by their square (Huber): half as steep there
 # as L1 on average, and growth goes by the gradient, hence STEEPER.
 KNEE, STEEPER = 2.0, 2.0
+SIZES_REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
 class HQGS(Method[FormedTarget]):
@@ -153,7 +154,7 @@ class HQGS(Method[FormedTarget]):
 
     def after_step(self, state: TrainState, view: View, seen: Tensor) -> None:
         """The smallest sizes and the cameras' depths age, and the held pixels decide on the rates."""
-        if self._smallest is not None and state.iteration - self._since >= 100:
+        if self._smallest is not None and state.iteration - self._since >= SIZES_REFRESH:
             self._measure(state.gaussians, state.iteration)
         if self._plateau is not None and len(seen):
             self._plateau.see(self._numbers[view.name], seen[0])
