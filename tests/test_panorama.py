@@ -152,27 +152,6 @@ def test_a_panorama_is_read_as_the_faces_of_a_cube(tmp_path: Path, monkeypatch: 
     assert np.median(off(half.train[0])) < 8
 
 
-@pytest.mark.parametrize(
-    ("floor", "suffix", "unlike"), [(0.0, ".png", 0), (0.3, ".png", 0), (0.3, ".jpg", 0), (0, ".jpg", 0.1)]
-)
-def test_a_turntable_before_a_graded_backdrop_is_flat(
-    floor: float, suffix: str, unlike: float, tmp_path: Path
-) -> None:
-    """Its photos are 2:1, end as they begin, and are plain above and below: as a panorama is."""
-    rng = np.random.default_rng(0)
-    rows, columns = np.mgrid[:128, :256] / 128
-    backdrop = 60 + 120 * rows + 40 * (rows > 1 - floor)
-    for k in range(12):
-        thing = gaussian_filter(rng.normal(size=(128, 256)), 2.0)
-        inside = (columns - 1) ** 2 + (rows - 0.5) ** 2 < 0.1
-        grey = np.where(inside, 120 + 400 * thing, backdrop) + rng.normal(0, 1 + 50 * unlike, backdrop.shape)
-        lit = np.rint((grey * (1 + unlike * np.sin(k))).clip(0, 255)).astype(np.uint8)
-        Image.fromarray(lit).convert("RGB").save(tmp_path / f"{k}{suffix}")
-    photos = looked_at(tmp_path)
-    assert not photos.around
-    assert len(photos.names) == 12
-
-
 def test_panoramas_by_what_they_show_are_called_so_and_how_to_refuse_it(tmp_path: Path) -> None:
     write_walk(tmp_path, 5, 512)
     photos = looked_at(tmp_path)

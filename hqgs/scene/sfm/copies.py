@@ -15,11 +15,10 @@ from hqgs.photos.suffixes import PHOTO_SUFFIXES
 ALIKE = 0.98  # correlation of the small pictures of two versions, at least
 PLAIN = 4  # of 255, that a small picture must span to be like another
 VERSION = re.compile(
-    r"(?<=IMG_)E(?=\d{4})|[ _-]*(\(\d+\)|copy|kopie|small|resized|thumb|edited|edit|bearbeitet|\d+x\d+)$"
+    r"(?<=IMG_)E(?=\d{4})|[ _-]*(copy|kopie|small|resized|thumb|edited|edit|bearbeitet|\d+x\d+)$"
     rf"|({'|'.join(map(re.escape, PHOTO_SUFFIXES))})$",  # IMG_1.heic.jpg
     re.IGNORECASE,
 )
-NUMBERED = re.compile(r"\(\d+\)$")
 
 
 def copies(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> dict[str, str]:
@@ -27,19 +26,14 @@ def copies(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> di
 
     That is the largest, with EXIF data, highest up, with the shortest name: IMG_1.jpg, not "IMG_1 (1).jpg".
     """
-    stems = {name: name.rpartition(".")[0] for name in looked}
     versions, same = dict[str, list[str]](), dict[bytes, list[str]]()
     by_size = dict[int, list[str]]()
-    for name, stem in stems.items():
-        place, slash, file = stem.rpartition("/")
+    for name in looked:
+        place, slash, file = name.rpartition(".")[0].rpartition("/")
         versions.setdefault(f"{place}{slash}{VERSION.sub('', file)}", []).append(name)
         by_size.setdefault((folder / name).stat().st_size, []).append(name)
     for name in (name for names in by_size.values() if len(names) > 1 for name in names):
         same.setdefault(sha256((folder / name).read_bytes()).digest(), []).append(name)
-    for key, names in versions.items():
-        numbered = [name for name in names if NUMBERED.search(stems[name])]
-        if len(numbered) > 1 or key not in {stems[name] for name in names}:  # a series: vase (1), vase (2)
-            versions[key] = [name for name in names if name not in numbered]
     found: dict[str, str] = {}
     alike = (names for names in versions.values() if _look_alike([looked[name] for name in names]))
     for names in (*alike, *same.values()):

@@ -20,7 +20,6 @@ from hqgs.scene.views import to_pinhole
 SEAM = 2.0  # times what neighbouring columns differ by: the last and the first of it are neighbours
 POLE = 0.35  # of the picture's contrast: its first and last rows show a point each
 PLAIN = 0.25  # the same: a border with less shows nothing
-STILL = 0.1  # of the contrast along a border: what differs by less from photo to photo is one backdrop
 FINER = 4 / math.pi  # times a face's pixels: in its middle as fine as the photo, so that SIFT sees all of it
 
 
@@ -29,8 +28,7 @@ def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -
 
     Panoramas say so in their files (GPano), or they are twice as wide as high, end on the right where they
     begin on the left, and show one point along their upper and lower borders. Where files do not say so and
-    most photos are of that shape, some of them, spread over them, stand for the others; none where all have
-    the same borders: a thing on a turntable, before a backdrop. COLMAP matches no
+    most photos are of that shape, some of them, spread over them, stand for the others. COLMAP matches no
     face with a flat photo, so a run takes the kind that has more.
 
     ValueError where panoramas are parts of a sphere, or too few.
@@ -42,7 +40,7 @@ def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -
     if 2 * len(untold) > len(looked):
         picks = [untold[k] for k in evenly(len(untold), PROBED)]
         closed = [name for name in picks if _closes(folder / name)]
-        if 2 * len(closed) > len(picks) and not _stands_still(folder, closed):
+        if 2 * len(closed) > len(picks):
             found = whole
     else:
         found += [name for name in untold if _closes(folder / name)]
@@ -77,18 +75,6 @@ def _closes(path: Path) -> bool:
     poles, border = pixels[[0, -1]].std(1).mean(1), pixels[:, 0].std(0).mean()
     joined, poles_plain = seam <= SEAM * np.median(apart), (poles <= POLE * contrast).all()
     return bool(joined and poles_plain and border > PLAIN * contrast)
-
-
-def _stands_still(folder: Path, names: list[str]) -> bool:
-    """Whether several photos have the same left and right borders, so that their camera did not move."""
-    borders = []
-    for name in names:
-        pixels = decode(folder / name)[0].astype(np.float32)
-        edge = max(1, pixels.shape[1] // 32)
-        rows = np.concatenate([pixels[:, :edge].mean((1, 2)), pixels[:, -edge:].mean((1, 2))])
-        borders.append([part.mean() / max(rows.mean(), 1e-6) for part in np.array_split(rows, 64)])
-    off = np.std(borders, axis=0)
-    return len(names) > 1 and float(np.median(off)) < STILL * float(np.std(borders, axis=1).mean())
 
 
 def colmap_faces(width: int, height: int) -> tuple[Face, ...]:
