@@ -59,8 +59,8 @@ def test_whoever_imported_a_function_calls_the_other_one() -> None:
 
 
 def test_lines_are_those_of_a_part_alone() -> None:
-    """`weighted` is imported by `sharpen` alone; what others import, too, stays."""
-    assert alone(["hqgs.scene.sfm.refine"]) > {"hqgs.scene.sfm.refine.weighted"}
+    """`align` is imported by `reconstruct` alone; what others import, too, stays."""
+    assert alone(["hqgs.scene.sfm.reconstruct"]) > {"hqgs.scene.sfm.align"}
     assert "hqgs.base.text" not in alone(["hqgs.cli.plan"])
     file = Path(hqgs.__file__).parent / "base" / "text.py"
     assert length("hqgs.base.text") == len(file.read_text(encoding="utf-8").splitlines())

@@ -36,7 +36,7 @@ def test_places_that_photos_bear_out_are_told_from_others(made: Made) -> None:  
     model.frames[model.images[4].frame_id].rig_from_world = pycolmap.Rigid3d(wrong)
     told = agreement(model, folder)
     assert [name for name, counts in told.items() if not confirmed(*counts)] == ["3.png"]
-    one = Outcome(False, 8, {}, [], [], agree={name: list(counts) for name, counts in told.items()})
+    one = Outcome(8, {}, [], agree={name: list(counts) for name, counts in told.items()})
     assert doubtful(one) == ["3.png"]
     looked, agreed, beside = told["3.png"]
     said = f"The poses of 1 photos may be wrong (tree.jpg): of {looked} points that should be visible,"
@@ -139,7 +139,7 @@ def test_parts_that_hang_on_few_points_are_told(made: Made) -> None:  # noqa: F8
     hung = rebuilt(model, [f"{k}.png" for k in range(8)], tracks)
     parts = loose_parts(hung)
     assert parts == [(["4.png", "5.png", "6.png"], 12), (["7.png"], 9)]
-    said = why_doubtful(Outcome(False, 8, {}, [], [], loose=parts))
+    said = why_doubtful(Outcome(8, {}, [], loose=parts))
     assert "4.png, 5.png, 6.png by 12 points; 7.png by 9 points. Take photos between these" in said
     more = replace(tracks, view=np.append(tracks.view, [2] * 8), point=np.append(tracks.point, range(60, 68)))
     more = replace(more, xy=rng.random((len(more.view), 2)))
@@ -156,12 +156,10 @@ def test_a_run_says_that_no_pose_can_be_trusted() -> None:
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     features = {f"{k}.png": 500 for k in range(4)}
     good, bad = [40, 30, 5], [40, 6, 5]
-    one = Outcome(
-        False, 4, features, [], [], agree={"0.png": bad, "1.png": bad, "2.png": good, "3.png": good}
-    )
-    assert len(Model(model, [one]).poses()) == 4
+    one = Outcome(4, features, [], agree={"0.png": bad, "1.png": bad, "2.png": good, "3.png": good})
+    assert len(Model(model, one).poses()) == 4
     worse = replace(one, agree=one.agree | {"2.png": bad})
     with pytest.raises(
         ValueError, match=r"most poses of these photos are probably wrong\. The poses of 3 photos"
     ):
-        Model(model, [worse]).poses()
+        Model(model, worse).poses()

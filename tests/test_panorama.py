@@ -370,7 +370,6 @@ def test_photos_alone_become_a_scene_of_faces(tmp_path: Path) -> None:
     assert len(scene.train) == 4 * len(CUBE)
     assert scene.sfm is not None
     assert (scene.sfm.photos, scene.sfm.not_registered) == (6, [])
-    assert set(scene.sfm.sure_px) == {f"{k:02d}.png" for k in range(6)}
     assert scene.seen is not None
     check_places(scene, poses)
     for view in scene.train:
@@ -421,6 +420,6 @@ def test_wrong_places_are_told_by_the_matches_that_they_contradict(tmp_path: Pat
     frame.rig_from_world = turn * pose
     wrong = borne_out(tmp_path / "colmap.db", model)
     assert 0.5 < wrong < 0.85  # those of 24 of 40 pairs are as they were
-    one = Outcome(False, 10, {}, [], [], borne_out=wrong)
+    one = Outcome(10, {}, [], borne_out=wrong)
     assert f"only {wrong:.0%} of the matches between panoramas fit them" in why_doubtful(one)
     assert why_doubtful(replace(one, borne_out=right)) == why_doubtful(replace(one, borne_out=None)) == ""

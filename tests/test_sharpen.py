@@ -1,4 +1,4 @@
-"""Observations moved to where photos agree, and smoothed versions of photos beside each other."""
+"""Observations moved to where photos agree, and smoothed copies of photos."""
 
 from __future__ import annotations
 
@@ -12,11 +12,9 @@ from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from hqgs.scene.sfm.database import join
 from hqgs.scene.sfm.passes import smooth_copy
 from hqgs.scene.sfm.refine import patches, sharpened
-from hqgs.scene.sfm.refine.tracks import Tracks, errors, read_tracks, rebuilt, sureness, usual
-from hqgs.scene.sfm.refine.weighted import weighted
+from hqgs.scene.sfm.refine.tracks import Tracks, errors, read_tracks, rebuilt, usual
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 160, 120, 150.0, 4.0
 NOISE = 12.0  # levels
@@ -104,7 +102,7 @@ def test_patches_make_poses_and_observations_more_precise(
     model, true, folder = made
     adjust(model, 1.0, True)
     by_features, off = turned(model, true), usual(model)
-    better = sharpened(model, folder, adjust, False)
+    better = sharpened(model, folder, adjust)
     assert better.num_reg_images() == 8
     assert usual(better) < 0.5 * off
     assert turned(better, true) < 0.5 * by_features
@@ -113,7 +111,7 @@ def test_patches_make_poses_and_observations_more_precise(
     assert better.num_points3D() > 0.8 * model.num_points3D()
     assert better.compute_mean_reprojection_error() < 0.5 * off
     monkeypatch.setattr(patches, "AT_ONCE", 200)  # what it holds at once changes no bit
-    again = sharpened(model, folder, adjust, False)
+    again = sharpened(model, folder, adjust)
     for k in range(1, 9):
         a, b = (m.images[k].cam_from_world().matrix() for m in (better, again))
         assert a.tobytes() == b.tobytes()
@@ -126,7 +124,7 @@ def test_large_photos_are_looked_at_smaller(
     adjust(model, 1.0, True)
     by_features, off = turned(model, true), usual(model)
     monkeypatch.setattr(patches, "PATCH_SIDE", 100)
-    better = sharpened(model, folder, adjust, False)
+    better = sharpened(model, folder, adjust)
     assert usual(better) < 0.6 * off
     assert turned(better, true) < 0.6 * by_features
 
@@ -139,7 +137,7 @@ def test_photos_that_do_not_fit_change_nothing(
     rng = np.random.default_rng(7)
     for file in folder.iterdir():
         Image.fromarray(rng.integers(0, 255, (HEIGHT, WIDTH)).astype(np.uint8)).save(file)
-    assert sharpened(model, folder, adjust, False) is model
+    assert sharpened(model, folder, adjust) is model
 
 
 def test_a_photo_unlike_the_others_keeps_its_observations(
@@ -150,7 +148,7 @@ def test_a_photo_unlike_the_others_keeps_its_observations(
     by_features = turned(model, true)
     grain = np.random.default_rng(7).integers(0, 255, (HEIGHT, WIDTH)).astype(np.uint8)
     Image.fromarray(grain).save(folder / "3.png")
-    better = sharpened(model, folder, adjust, False)
+    better = sharpened(model, folder, adjust)
     assert better.num_reg_images() == 8
     before, after = (m.images[4].num_points3D for m in (model, better))
     assert after > 0.5 * before
@@ -171,63 +169,6 @@ def test_tracks_are_read_and_written(made: tuple[pycolmap.Reconstruction, list[n
     assert both.point.max() == len(both.points) - 1
 
 
-def test_sureness_is_what_a_pose_is_off_by_noise(
-    made: tuple[pycolmap.Reconstruction, list[np.ndarray], Path],
-) -> None:
-    """Where the points are known: the poses are fitted to observations that scatter by 0.7 px."""
-    model, _, _ = made
-    names, tracks = read_tracks(model)
-    rng, sigma = np.random.default_rng(2), 0.7
-    images = {image.name: image for image in model.images.values()}
-    where = np.zeros_like(tracks.xy)
-    for k, name in enumerate(names):
-        mine = tracks.view == k
-        inside = images[name].cam_from_world() * tracks.points[tracks.point[mine]]
-        where[mine] = images[name].camera.img_from_cam(inside)
-    moved, noisy = list[float](), model
-    for _ in range(10):
-        noisy = rebuilt(model, names, replace(tracks, xy=where + sigma * rng.standard_normal(where.shape)))
-        options = pycolmap.BundleAdjustmentOptions()
-        options.print_summary = options.refine_points3D = False
-        options.refine_focal_length = options.refine_extra_params = False
-        pycolmap.bundle_adjustment(noisy, options)
-        for k, name in enumerate(names):
-            mine = tracks.view == k
-            image = next(image for image in noisy.images.values() if image.name == name)
-            at = image.camera.img_from_cam(image.cam_from_world() * tracks.points[tracks.point[mine]])
-            moved.append(np.square(at - where[mine]).sum(1).mean())
-    sure = sureness(noisy)
-    assert sorted(sure) == names
-    assert np.median(list(sure.values())) == pytest.approx(np.sqrt(np.mean(moved)), rel=0.35)
-    few = tracks.chosen((tracks.view > 0) | (np.arange(len(tracks.view)) % 4 == 0))
-    assert sureness(rebuilt(noisy, names, few))["0.png"] > 1.5 * sure["0.png"]
-
-
-def test_versions_lie_side_by_side(tmp_path: Path) -> None:
-    def database(name: str) -> Path:
-        with pycolmap.Database.open(tmp_path / name) as db:
-            camera = pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=9, height=9, params=[9, 4, 4])
-            db.write_camera(camera, use_camera_id=True)
-            for k in (1, 2):
-                db.write_image(pycolmap.Image(name=f"{k}.png", camera_id=1, image_id=k), use_image_id=True)
-        return tmp_path / name
-
-    rng = np.random.default_rng(0)
-    points = {name: [rng.random((n, 6)).astype(np.float32) for n in (3, 4)] for name in ("a", "b")}
-    for name, of_photos in points.items():
-        with pycolmap.Database.open(database(name)) as db:
-            for k, found in enumerate(of_photos, 1):
-                db.write_keypoints(k, found)
-            db.write_matches(1, 2, np.array([[0, 1], [2, 3]] if name == "a" else [[1, 0]], np.uint32))
-    join([tmp_path / "a", tmp_path / "b"], database("all"), 2)
-    with pycolmap.Database.open(tmp_path / "all") as db:
-        for k in (0, 1):
-            np.testing.assert_array_equal(
-                db.read_keypoints(k + 1), np.concatenate([points["a"][k], points["b"][k]])
-            )
-        assert np.asarray(db.read_matches(1, 2)).tolist() == [[0, 1], [2, 3], [4, 4]]
-
-
 def test_smoothed_copies_are_those_of_what_sift_sees(tmp_path: Path) -> None:
     (tmp_path / "photos" / "a").mkdir(parents=True)
     photo = np.zeros((41, 61), np.uint8)
@@ -239,44 +180,3 @@ def test_smoothed_copies_are_those_of_what_sift_sees(tmp_path: Path) -> None:
         with Image.open(copy) as image:
             assert image.getpixel((30, 20)) == pytest.approx(255 / (2 * np.pi * sigma**2), rel=0.05)
         assert [p.name for p in copy.parent.iterdir()] == ["dot.png"]
-
-
-def test_observations_count_by_their_precision_in_each_direction() -> None:
-    rng = np.random.default_rng(0)
-    model, names = pycolmap.Reconstruction(), [f"{k}.png" for k in range(6)]
-    params = np.array([FOCAL, WIDTH / 2, HEIGHT / 2, 0.02])
-    given = pycolmap.Camera(
-        model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params * [1.03, 1, 1, 0], camera_id=1
-    )
-    model.add_camera_with_trivial_rig(given)
-    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params, camera_id=1)
-    points = rng.uniform([-1, -0.7, 2], [1, 0.7, 6], (200, 3))
-    true, xy = [], []
-    for k, name in enumerate(names):
-        R = Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix()
-        t = rng.normal(0, 0.4, 3) * [1, 1, 0.3]
-        true.append(np.c_[R, t])
-        xy.append(camera.img_from_cam(points @ R.T + t))
-        near = pycolmap.Rotation3d(Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix() @ R)
-        image = pycolmap.Image(name=name, keypoints=xy[-1], camera_id=1, image_id=k + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(near, t + rng.normal(0, 0.01, 3)))
-    angle = rng.uniform(0, np.pi, 1200)
-    ways = np.stack([np.cos(angle), np.sin(angle)], 1)  # along edges: ten times less is known there
-    other = np.stack([-ways[:, 1], ways[:, 0]], 1)
-    noise = rng.normal(0, 3.0, (1200, 1)) * ways + rng.normal(0, 0.1, (1200, 1)) * other
-    tracks = Tracks(
-        points + rng.normal(0, 0.02, points.shape), np.zeros((200, 3), np.uint8),
-        np.repeat(np.arange(6), 200), np.tile(np.arange(200), 6), np.concatenate(xy) + noise,
-    )  # fmt: skip
-    across = np.einsum("oi,oj->oij", ways, ways) / 9 + np.einsum("oi,oj->oij", other, other) / 0.01
-    found = {}
-    for name, information in (("each way", across), ("the same", np.tile(np.eye(2), (1200, 1, 1)))):
-        copy = pycolmap.Reconstruction(model)
-        weighted(copy, names, tracks, information, True)
-        found[name] = turned(copy, true), abs(copy.cameras[1].params[0] / FOCAL - 1)
-    assert found["each way"][0] < 0.2 * found["the same"][0], found
-    assert found["each way"][1] < 0.005, found
-    again, off = weighted(copy, names, tracks, across, True)
-    assert 0.5 < np.median(off) < 1.6  # deviations
-    left = np.abs(((again.xy - tracks.xy) * other).sum(1)), np.abs(((again.xy - tracks.xy) * ways).sum(1))
-    assert np.median(left[0]) < 0.05 < 0.5 < np.median(left[1])  # only along edges they follow their points

@@ -35,9 +35,7 @@ from hqgs.scene.load import load_scene
 from hqgs.scene.named_split import listed_split, names_by_any
 from hqgs.scene.photo_files import below
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.failure import Outcome, why_doubtful
 from hqgs.scene.sfm.likely import likely_pairs
-from hqgs.scene.sfm.run import Model
 from hqgs.scene.sfm.triangulated import SparsePoints, triangulated
 
 LATIN = "caf\udce9 1.png"  # é in the code of an older Windows, as Python reads it from the disk
@@ -321,13 +319,6 @@ def test_lists_of_a_split_know_folders(tmp_path: Path) -> None:
     for name in ("cam1/001.png", "x/cam1/001.jpg", "001"):
         assert replace(split, test=[name]).names_any(known), name
     assert replace(split, test=["images/7.png"]).names_any(names_by_any(["7.png"]))
-
-
-def test_the_pass_whose_model_it_is_is_told() -> None:
-    plain = Outcome(False, 10, {"a": 500, "b": 500}, [], [])
-    tolerant = Outcome(True, 9, {"a": 500, "b": 500}, [], [], agree={"a": [40, 6, 5]})
-    model = Model(None, [plain, tolerant], chosen=1)  # pyright: ignore[reportArgumentType]
-    assert "of 40 points that should be visible, 6 are found" in why_doubtful(model.passes[model.chosen])
 
 
 def test_photos_without_a_feature_have_no_likely_pairs(monkeypatch: pytest.MonkeyPatch) -> None:

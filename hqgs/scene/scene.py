@@ -166,34 +166,19 @@ class SfmReport:
     # Median distance from where the scene's own cameras see the new points to the photos; None: most are
     # behind them.
     own_cameras_px: float | None = None
-    point_distance: float | None = None  # from the new points to the nearest of the scene's own, median
-    own_points: int | None = None  # the scene's, and of them
-    own_track_length: float | None = None  # None: its files do not tell
-    own_reprojection_error_px: float | None = None
+    own_points: int | None = None  # the scene's
     unreadable: dict[str, str] = field(default_factory=dict)  # files that were left out before, and why
-    first_pass: int | None = None  # photos that the first pass registered, where it took a second one
     advice: str | None = None  # where photos are missing: what was found, and what to do
     lost: dict[str, str] = field(default_factory=dict)  # photos without a place, and why
-    sure_px: dict[str, float] = field(default_factory=dict)  # of each photo with a place; see `sureness`
     auc: dict[str, float] | None = None  # of pairs' pose errors up to "1", "3", "5" degrees; see `pose_auc`
 
     def __str__(self) -> str:
         text = self._found() if self.rotation_error_deg is None else self._compared()
-        if self.first_pass is not None:
-            text += (
-                f"; a first pass registered {self.first_pass}, a second pass with weaker limits the others"
-            )
         if self.not_registered:
             names = [
                 f"{name} ({self.lost[name]})" if name in self.lost else name for name in self.not_registered
             ]
             text += f"; {len(names)} left out, as COLMAP found no pose for them: {some(names)}"
-        if self.sure_px:
-            name, least = max(self.sure_px.items(), key=lambda item: item[1])
-            usual = float(np.median(list(self.sure_px.values())))
-            text += (
-                f"; poses are exact to {usual:.2f} px (median), the least exact, of {name}, to {least:.2f} px"
-            )
         if self.unreadable:
             files = ", ".join(f"{name} ({why})" for name, why in self.unreadable.items())
             text += f"; {len(self.unreadable)} left out, as they cannot be read: {files}"
@@ -222,13 +207,10 @@ class SfmReport:
             f"rotations differ from the scene's own by {rotation['median']:.3f} deg (median) and "
             f"{rotation['max']:.3f} deg (max), camera centres by {translation['median']:.2%} and "
             f"{translation['max']:.2%} of the extent; the scene's own cameras see the new points "
-            f"{seen}; {self.points} points (own: {self.own_points}), the nearest own point "
-            f"{self.point_distance:.2%} of the extent away (median); "
+            f"{seen}; {self.points} points (own: {self.own_points}), "
             f"{self.track_length:.1f} photos per point, mean error {self.reprojection_error_px:.2f} px"
         )
         if self.auc is not None:
             within = ", ".join(f"{value:.2f} at {limit} deg" for limit, value in self.auc.items())
             text += f"; AUC {within}"
-        if self.own_track_length is not None:
-            text += f" (own: {self.own_track_length:.1f} and {self.own_reprojection_error_px:.2f} px)"
         return text

@@ -5,7 +5,6 @@ It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's pro
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,7 @@ LEAST_PHOTOS = 3  # of a scene or model: one alone shows no depth
 PROBED = 8  # photos that tell of all what files do not: how rich they are, whether they are panoramas
 LARGEST = 1600  # px a side: features of larger photos cost minutes and place no camera better than that
 FOCAL = pycolmap.ImageReaderOptions().default_focal_length_factor  # in longer sides, where nothing tells
-
-
+MATCHES, INLIERS = "read_num_matches", "read_two_view_geometry_num_inliers"  # of the database
 BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
 
 
@@ -127,39 +125,13 @@ def match(directory: Path, names: list[str], pairs: Any, threads: int, database:
 
 
 def table(database: Path, photos: int, read: str) -> NDArray[np.int64]:
-    """Counts [V, V] of each pair of photos, by the method `read` of the database."""
+    """Counts [V, V] of each pair of photos, MATCHES or INLIERS."""
     found = np.zeros((photos, photos), np.int64)
     with pycolmap.Database.open(database) as db:
         for pair, count in zip(*getattr(db, read)(), strict=True):
             a, b = (number - 1 for number in pycolmap.pair_id_to_image_pair(pair))
             found[a, b] = found[b, a] = count
     return found
-
-
-def join(versions: Sequence[Path], into: Path, photos: int) -> None:
-    """Write the features and matches of versions of photos, a database each, into one that has the photos.
-
-    Features of the first version come first. Each version was matched by itself: a feature that two versions
-    show would pass for ambiguous.
-    """
-    keypoints = [[np.zeros((0, 6), np.float32)] * photos for _ in versions]
-    matches: dict[tuple[int, int], list[np.ndarray]] = {}
-    before = np.zeros(photos, np.int64)  # features of earlier versions
-    for found, version in zip(keypoints, versions, strict=True):
-        with pycolmap.Database.open(version) as db:
-            for k in range(photos):
-                if db.exists_keypoints(k + 1):
-                    found[k] = np.asarray(db.read_keypoints(k + 1), np.float32)
-            for pair, rows in zip(*db.read_all_matches(), strict=True):
-                first, second = pycolmap.pair_id_to_image_pair(pair)
-                moved = np.asarray(rows, np.int64) + before[[first - 1, second - 1]]
-                matches.setdefault((first, second), []).append(moved)
-        before = before + [len(one) for one in found]
-    with pycolmap.Database.open(into) as db:
-        for k in range(photos):
-            db.write_keypoints(k + 1, np.concatenate([found[k] for found in keypoints]))
-        for (first, second), rows in sorted(matches.items()):
-            db.write_matches(first, second, np.concatenate(rows).astype(np.uint32))
 
 
 def pipeline_options() -> pycolmap.IncrementalPipelineOptions:

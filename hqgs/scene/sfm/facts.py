@@ -11,33 +11,26 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from hqgs.scene.sfm.database import INLIERS, MATCHES, table
+
 EPIPOLAR = pycolmap.TwoViewGeometryOptions().ransac.max_error  # px from its epipolar line that a match may be
 
 
-def counts(database: Path, placed: set[str]) -> dict[str, Any]:
-    """Features of each photo, matches and those that a geometry bears out of each pair, both sorted.
+def counts(database: Path, names: list[str], placed: set[str]) -> dict[str, Any]:
+    """Features of each photo, and the matches of each pair that a geometry bears out, sorted.
 
     Of each photo also its best pair's, and how many one with a photo that has a place bears out.
     """
     with pycolmap.Database.open(database) as db:
-        images = {image.image_id: image.name for image in db.read_all_images()}
-        features = {name: int(db.num_keypoints_for_image(k)) for k, name in images.items()}
-        matches = _by_pair(images, *db.read_num_matches())
-        inliers = _by_pair(images, *db.read_two_view_geometry_num_inliers())
-    best = {name: [0, 0, 0] for name in features}
-    for column, found in enumerate((matches, inliers)):
-        for pair, count in found.items():
-            for name in pair:
-                best[name][column] = max(best[name][column], count)
-    for (a, b), count in inliers.items():
-        for one, other in ((a, b), (b, a)):
-            if other in placed:
-                best[one][2] = max(best[one][2], count)
+        features = {name: int(db.num_keypoints_for_image(k)) for k, name in enumerate(names, 1)}
+    matches, inliers = (table(database, len(names), read) for read in (MATCHES, INLIERS))
+    has = np.array([name in placed for name in names])
+    best = np.stack([matches.max(1), inliers.max(1), (inliers * has).max(1)], 1)
+    pairs = inliers[np.triu(inliers) > 0]
     return {
         "features": features,
-        "matches": sorted(matches.values(), reverse=True),
-        "inliers": sorted(inliers.values(), reverse=True),
-        "best": best,
+        "inliers": sorted(pairs.tolist(), reverse=True),
+        "best": dict(zip(names, best.tolist(), strict=True)),
     }
 
 
@@ -76,9 +69,3 @@ def apart(models: list[set[str]], least: int) -> list[list[str]]:
             found.append(sorted(names - known))
         known |= names
     return found
-
-
-def _by_pair(images: dict[int, str], pairs: Any, counts: Any) -> dict[tuple[str, str], int]:
-    """Counts by the names of two photos."""
-    ids = (pycolmap.pair_id_to_image_pair(pair) for pair in pairs)
-    return {(images[a], images[b]): int(count) for (a, b), count in zip(ids, counts, strict=True)}

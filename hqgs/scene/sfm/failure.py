@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -21,13 +20,11 @@ BORNE_OUT = 0.85  # of matches between panoramas: 0.91 and 0.93 at right places,
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one pass of COLMAP came to."""
+    """What COLMAP's best pass came to."""
 
-    tolerant: bool
     registered: int  # photos
     features: dict[str, int]  # of each photo
-    matches: list[int]  # of each pair that has any, sorted
-    inliers: list[int]  # of them, those that one geometry bears out, sorted
+    inliers: list[int]  # of each pair, the matches that one geometry bears out, sorted
     best: dict[str, list[int]] = field(default_factory=dict)  # of each photo's best pairs: matches, of them
     # those that a geometry bears out, and the same with a photo that has a place
     apart: list[list[str]] = field(default_factory=list)  # photos that fit each other, and no others
@@ -38,44 +35,26 @@ class Outcome:
     borne_out: float | None = None  # share of the inliers that the places of panoramas bear out
 
 
-class Cause(NamedTuple):
-    """A cause that passes over so many photos show, and what to do about it."""
-
-    found: Callable[[int, Sequence[Outcome]], bool]
-    advice: str
-
-
-CAUSES = (  # the first that is found counts
-    Cause(
-        lambda photos, passes: _usual(passes[0].features) < FEW_FEATURES,
-        "So few features mean that photos are blurred or dark, or surfaces have no texture: take sharp "
-        "photos of things with texture",
-    ),
-    Cause(
-        lambda photos, passes: _pairs(passes[-1]) == 0,
-        "The photos have enough detail, but do not overlap. Take each photo so that two thirds of it show "
-        "what the next photo shows",
-    ),
-    Cause(
-        lambda photos, passes: any(one.registered for one in passes),
-        "The other photos overlap too little with these: take more photos in between",
-    ),
-    Cause(
-        lambda photos, passes: photos < 10,
-        "There are too few photos: take 20 to 100, a step apart, each overlapping the next",
-    ),
-    Cause(
-        lambda photos, passes: True,
-        "The photos overlap, but were taken from one place, or from places too far apart: walk around the "
-        "scene and take a photo at each step",
-    ),
-)
-
-
-def why_few(photos: int, passes: Sequence[Outcome]) -> str:
+def why_few(one: Outcome) -> str:
     """Why few of the photos have a place, or none, with counts, and what to do; a sentence or two."""
-    advice = next(cause.advice for cause in CAUSES if cause.found(photos, passes))
-    return f"{counts(photos, passes)}. {advice}"
+    if _usual(one.features) < FEW_FEATURES:
+        advice = (
+            "So few features mean that photos are blurred or dark, or surfaces have no texture: take sharp "
+            "photos of things with texture"
+        )
+    elif _pairs(one) == 0:
+        advice = (
+            "The photos have enough detail, but do not overlap. Take each photo so that two thirds of it "
+            "show what the next photo shows"
+        )
+    elif one.registered:
+        advice = "The other photos overlap too little with these: take more photos in between"
+    else:
+        advice = (
+            "The photos overlap, but are too few (take 20 to 100), were taken from one place, or from places "
+            "too far apart: walk around the scene and take a photo at each step"
+        )
+    return f"{counts(one)}. {advice}"
 
 
 def why_lost(name: str, one: Outcome) -> str:
@@ -93,8 +72,8 @@ def why_lost(name: str, one: Outcome) -> str:
     return f"too few matches ({with_placed}) with photos that have a pose"
 
 
-def what_to_take(lost: Mapping[str, str], names: Sequence[str], apart: Sequence[Sequence[str]]) -> str:
-    """What to photograph so that the lost photos, by `why_lost`, find a place; `names`: of all, sorted."""
+def what_to_take(lost: Mapping[str, str], apart: Sequence[Sequence[str]]) -> str:
+    """What to photograph so that the lost photos, by `why_lost`, find a place."""
     captures = [[name for name in group if name in lost] for group in apart]
     said = [
         f"{len(group)} photos match each other but no others ({some(group)}): put another scene into its own "
@@ -106,12 +85,7 @@ def what_to_take(lost: Mapping[str, str], names: Sequence[str], apart: Sequence[
     if blurred := [name for name in others if lost[name].startswith("blurred")]:
         said.append(f"take these photos again, sharp and bright: {some(blurred)}")
     if loose := [name for name in others if name not in blurred]:
-        between = []
-        for name in loose:
-            k = names.index(name)
-            near = [*reversed(names[:k]), *names[k + 1 :]] if k else names[1:]
-            between += [f"{other} and {name}" for other in near if other not in lost][:1]
-        said.append(f"take photos between {some(between)}")
+        said.append(f"take photos between the others and {some(loose)}")
     return "; ".join(said)
 
 
@@ -148,17 +122,14 @@ def why_doubtful(one: Outcome, called: Callable[[str], str] = str) -> str:
     )
 
 
-def counts(photos: int, passes: Sequence[Outcome]) -> str:
+def counts(one: Outcome) -> str:
     """What was found, in numbers."""
-    first, pairs = passes[0], photos * (photos - 1) // 2
-    fewest = min(first.features.values(), default=0)
-    found = (
-        f"It found {int(_usual(first.features)):,} features per photo (median; fewest {fewest:,}), and "
-        f"{_pairs(first):,} of {pairs:,} pairs of photos match (most matches: {max([0, *first.inliers]):,})"
+    photos, fewest = len(one.features), min(one.features.values(), default=0)
+    return (
+        f"It found {int(_usual(one.features)):,} features per photo (median; fewest {fewest:,}), and "
+        f"{_pairs(one):,} of {photos * (photos - 1) // 2:,} pairs of photos match (most matches: "
+        f"{max([0, *one.inliers]):,})"
     )
-    if len(passes) > 1:
-        found += f"; in a second pass with weaker limits {_pairs(passes[1]):,} pairs"
-    return found
 
 
 def _usual(features: Mapping[str, int]) -> float:

@@ -23,7 +23,6 @@ from hqgs.scene.paths import UP
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
 from hqgs.scene.sfm.database import LARGEST
-from hqgs.scene.sfm.refine.tracks import sureness
 from hqgs.scene.sfm.run import run_colmap
 
 LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on none
@@ -75,10 +74,8 @@ def find_cameras(root: Path, photos: BarePhotos, search: Search) -> FoundCameras
         track_length=model.compute_mean_track_length(),
         reprojection_error_px=model.compute_mean_reprojection_error(),
         unreadable=photos.unreadable,
-        first_pass=ran.first_pass,
         advice=ran.advice(),
         lost={as_text(name): why for name, why in ran.lost().items() if name not in poses},
-        sure_px=_together(sureness(model), names),
     )
     return FoundCameras(photos, model, report)
 
@@ -147,17 +144,6 @@ def as_stored(model: pycolmap.Reconstruction, sizes: list[tuple[int, int]], face
     for number, camera in model.cameras.items():
         camera.rescale(*wanted[number])
     model.update_point_3d_errors()
-
-
-def _together(sure: dict[str, float], names: dict[str, str]) -> dict[str, float]:
-    """`sureness` by photo from that by file: what the faces of a panorama tell of its pose adds up."""
-    told: dict[str, list[float]] = {}
-    for file, px in sure.items():
-        told.setdefault(as_text(names[file]), []).append(px)
-    return {
-        name: float(np.square(np.reciprocal(px)).sum() ** -0.5) if len(px) > 1 else px[0]
-        for name, px in told.items()
-    }
 
 
 def _upright(viewmats: NDArray[np.float64], exif: list[Exif]) -> NDArray[np.float64]:

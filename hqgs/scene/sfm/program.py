@@ -36,7 +36,7 @@ import numpy as np
 import pycolmap
 
 from hqgs.scene.sfm.database import LARGEST, extract, known_cameras, match, pipeline_options
-from hqgs.scene.sfm.passes import COARSE, Work, attempts
+from hqgs.scene.sfm.passes import COARSE, Work, best_attempt
 
 MIN_TRACK, MAX_ERROR = 3, 1.0  # a point needs so many photos, and may miss them by so many px on average
 
@@ -77,10 +77,9 @@ def reconstruct(directory: Path, threads: int) -> None:
     What is found of one photo or pair depends on no other, not even its random numbers, and is read back in
     the order of numbers. Mapping has one thread and the seed 0.
     """
-    passes = attempts(Work(directory, _given(directory), threads))
-    best = max(passes, key=lambda one: one.registered)
+    best = best_attempt(Work(directory, _given(directory), threads))
     best.refine()
-    facts = json.dumps({"passes": [one.facts() for one in passes], "chosen": passes.index(best)})
+    facts = json.dumps(best.facts())
     (directory / "facts.json").write_text(facts, encoding="utf-8")
     if best.model is not None:
         (directory / "model").mkdir(exist_ok=True)

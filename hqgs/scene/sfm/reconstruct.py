@@ -6,14 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.formats.colmap import seen_points
 from hqgs.scene.scene import Scene, SfmReport, TrackStatistics, View
 from hqgs.scene.sfm.align import Floats, align, camera_centers, pose_auc, refine, rotation_angles
-from hqgs.scene.sfm.refine.tracks import read_tracks, sureness
+from hqgs.scene.sfm.refine.tracks import read_tracks
 from hqgs.scene.sfm.run import run_colmap
 from hqgs.scene.sfm.triangulated import write_photos
 
@@ -57,7 +56,6 @@ def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent
     ]
     tracks = TrackStatistics(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
     off = float(np.median(misses))  # infinite where the own cameras have most of the points behind them
-    distances, _ = KDTree(scene.points).query(points)
     rotation, translation = _compared(viewmats, own, scene.extent)
     report = SfmReport(
         photos=len(views),
@@ -65,15 +63,10 @@ def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent
         outliers=[view.name for view, inlier in zip(kept, inliers, strict=True) if not inlier],
         own_cameras_px=off if np.isfinite(off) else None,
         points=len(points),
-        point_distance=float(np.median(distances)) / scene.extent,
         track_length=tracks.length,
         reprojection_error_px=tracks.error,
         own_points=len(scene.points),
-        own_track_length=None if scene.tracks is None else scene.tracks.length,
-        own_reprojection_error_px=None if scene.tracks is None else scene.tracks.error,
-        first_pass=ran.first_pass,
         lost=ran.lost(),
-        sure_px={views[file].name: px for file, px in sureness(model).items()},
         rotation_error_deg=rotation,
         translation_error=translation,
         auc=dict(zip("135", pose_auc(viewmats, own, len(views)), strict=True)),

@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -27,23 +28,18 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
 from hqgs.scene.sfm import likely
-from hqgs.scene.sfm.database import LARGEST, LEAST_PHOTOS
+from hqgs.scene.sfm.database import LEAST_PHOTOS
 from hqgs.scene.sfm.failure import Outcome, counts, doubtful, what_to_take, why_doubtful, why_few, why_lost
-from hqgs.scene.sfm.likely import MATCHED_ALL, PARTNERS
 
-AGAIN_SAID = {
-    "smoothed": ", with smoothed photos",
-    "joined": ", with smoothed photos",
-    "tolerant": ", second and more tolerant pass",
-}
 LEAST_SHARE = 0.5  # of the photos must find their place in a model
-LONG, MANY = 60.0, 150  # s, photos: from where on the user is told before it begins
-AGAIN = 4  # times the first pass, that all passes take at most
+MANY = 150  # photos: from where on the user is told before it begins
 
+_BLOCK = re.compile(r"Processing block \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
 PROGRAM = Path(__file__).with_name("program.py")
-FORMAT = 3  # of what is kept: raised by hand where other poses or points would be found, or stored otherwise
+FORMAT = 4  # of what is kept: raised by hand where other poses or points would be found, or stored otherwise
 STAGES = {
     "features": "COLMAP: features",
+    "smoothed": "COLMAP: features of smoothed photos",
     "matches": "COLMAP: pairs of photos matched",
     "verify": "COLMAP: matches checked",
     "place": "COLMAP: photos placed",
@@ -67,33 +63,28 @@ class Guess:
 
 @dataclass(frozen=True)
 class Model:
-    """COLMAP's largest model, and what its passes came to: one, or a second, more tolerant one."""
+    """COLMAP's largest model, and what its best pass came to."""
 
     found: pycolmap.Reconstruction
-    passes: list[Outcome]
+    outcome: Outcome
     called: Mapping[str, str] = field(default_factory=dict)  # what the user calls photos, by COLMAP's names
-    chosen: int = 0  # the pass whose model it is
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
         """World-to-camera matrices [4, 4] by photo, sorted; ValueError where too few photos have one, or most
         are no better than chance."""
-        poses, photos = registered(self.found), len(self.passes[0].features)
+        poses, photos = registered(self.found), len(self.outcome.features)
         if len(poses) < max(LEAST_PHOTOS, LEAST_SHARE * photos):
             raise ValueError(
                 f"COLMAP registered only {len(poses)} of {photos} photos, wanted at least {LEAST_PHOTOS} and "
-                f"{LEAST_SHARE:.0%}. {why_few(photos, self.passes)}. {self._to_take()}".strip()
+                f"{LEAST_SHARE:.0%}. {why_few(self.outcome)}. {self._to_take()}".strip()
             )
-        if 2 * len(doubtful(self._chosen)) > len(poses):
+        if 2 * len(doubtful(self.outcome)) > len(poses):
             raise ValueError(f"most poses of these photos are probably wrong. {self.advice()}")
         return poses
 
-    @property
-    def _chosen(self) -> Outcome:
-        return self.passes[self.chosen]
-
     def lost(self) -> dict[str, str]:
         """Photos that have no place, sorted, and why."""
-        placed, one = registered(self.found), self._chosen
+        placed, one = registered(self.found), self.outcome
         rich = sorted(one.features, key=lambda name: one.features[name])  # of faces the last one tells
         lost = {self._name(name): why_lost(name, one) for name in rich if name not in placed}
         return dict(sorted(lost.items()))
@@ -101,52 +92,16 @@ class Model:
     def advice(self) -> str | None:
         """What to do about photos that have no place, or places in doubt; None: there are none."""
         told = self._to_take()
-        told = f"{counts(len(self.passes[0].features), self.passes)}. {told}" if told else ""
-        return ". ".join(filter(None, (told, why_doubtful(self._chosen, self._name)))) or None
+        told = f"{counts(self.outcome)}. {told}" if told else ""
+        return ". ".join(filter(None, (told, why_doubtful(self.outcome, self._name)))) or None
 
     def _to_take(self) -> str:
-        names = sorted(set(map(self._name, self._chosen.features)))
-        apart = [sorted(map(self._name, group)) for group in self._chosen.apart]
-        told = what_to_take(self.lost(), names, apart)
+        apart = [sorted(map(self._name, group)) for group in self.outcome.apart]
+        told = what_to_take(self.lost(), apart)
         return told[:1].upper() + told[1:]
 
     def _name(self, name: str) -> str:
         return self.called.get(name, name)
-
-    @property
-    def first_pass(self) -> int | None:
-        """Photos that the first pass registered, where a second one was made. None: one was enough."""
-        return self.passes[0].registered if len(self.passes) > 1 else None
-
-
-def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: bool = False) -> str:
-    """A sentence on how long COLMAP takes, where that may be more than a minute; else nothing.
-
-    `sizes` [V, 2] of the photos, px; `pairs` that are matched, None: all, or of many photos the likely ones.
-    The range is that of photos with little and with much detail, measured on two threads of an AMD EPYC,
-    where the first pass places enough of them; the other passes (`program.py`) are as long each.
-    """
-    count = len(sizes)
-    if pairs is None:
-        pairs = count * (count - 1) // 2 if count <= MATCHED_ALL else count * PARTNERS
-    stored = sizes.prod(axis=1) / 1e6  # megapixels
-    seen = stored * np.minimum(1, LARGEST / sizes.max(axis=1)) ** 2
-    share = 2 / threads
-    least = share * (0.8 * seen.sum() + 0.015 * pairs) + 0.02 * pairs
-    most = share * (2.2 * seen.sum() + 0.4 * pairs * min(1, seen.mean()) ** 2) + 0.05 * pairs + 1.6 * count
-    if coarse:
-        least = share * (0.15 * seen.sum() + 0.01 * pairs)
-        most = share * (1.1 * seen.sum() + 0.03 * pairs) + 0.02 * pairs + 0.4 * count
-    if most < LONG:
-        return ""
-    shrunk = f", scaled down for COLMAP to {seen.mean():.1f}" if seen.mean() < 0.9 * stored.mean() else ""
-    advice = "; 100 photos are enough for most scenes" if count > MANY else ""
-    return (
-        f"{count} photos of {stored.mean():.1f} megapixels{shrunk}: finding their cameras takes "
-        f"{max(1, round(least / 60))} to {max(2, round(most / 60))} minutes on {threads} "
-        f"thread{'s' * (threads > 1)}; where photos find no pose, COLMAP also tries smoothed copies, up to "
-        f"{AGAIN * max(2, round(most / 60))} minutes in all{advice}"
-    )
 
 
 def run_colmap(
@@ -197,9 +152,8 @@ def run_colmap(
     kept = None if keep is None else keep / key_of(str(sorted(given)), _pieces(names, contents, given))
     if kept is not None and kept.is_dir():
         return _read(kept, called or {})
-    sizes = given["sizes"][given["camera_of"]] if "camera_of" in given else given["sizes"]
-    pairs = len(given["pairs"]) if "pairs" in given else None
-    if note := expected_time(sizes, pairs, get_num_threads(), coarse):
+    if len(names) > MANY:
+        note = f"{len(names)} photos take COLMAP long; 100 are enough for most scenes"
         on_stage(Stage("COLMAP", 0, len(names), note))
     with _workplace(kept) as directory:
         photos = directory / "photos"
@@ -215,9 +169,8 @@ def run_colmap(
         given["photos"] = np.array(str(photos))
         np.savez(directory / "input.npz", **given)  # pyright: ignore[reportArgumentType]
         run_program("reconstruct", directory, on_stage)
-        facts = directory / "facts.json"
         if not (directory / "model" / "images.bin").is_file():
-            told = why_few(len(names), _passes(facts)[0])
+            told = why_few(_outcome(directory / "facts.json"))
             raise ValueError(f"COLMAP found no poses for these {len(names)} photos. {told}")
         if kept is not None:
             keep_folder(directory / "model", kept)
@@ -266,7 +219,7 @@ def run_program(
                 except subprocess.TimeoutExpired:
                     if time.monotonic() >= end:
                         raise ValueError(f"COLMAP took more than {time_limit:g} s") from None
-                    _tell(directory / "stage.json", on_stage)
+                    _tell(directory, on_stage)
         finally:
             process.kill()
             process.wait()
@@ -278,22 +231,28 @@ def run_program(
         raise ValueError(f"COLMAP ended with status {status} {' '.join(last)}".strip())
 
 
-def _tell(file: Path, on_stage: OnStage) -> None:
+def _tell(directory: Path, on_stage: OnStage) -> None:
+    """Not by COLMAP's database: two libraries of SQLite take each other's locks away."""
     try:
-        now: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        now: dict[str, Any] = json.loads((directory / "stage.json").read_text(encoding="utf-8"))
     except FileNotFoundError:  # it has only begun
         return
-    on_stage(Stage(STAGES[now["stage"]] + AGAIN_SAID.get(now["pass"], ""), now["done"], now["total"]))
+    done, total = now["done"], now["total"]
+    text = (directory / "log.txt").read_bytes()[now["log"] :].decode(errors="replace")
+    if now["stage"] == "matches" and (blocks := _BLOCK.findall(text)):
+        row, rows, column, columns = (int(part or 1) for part in blocks[-1])
+        done = round(total * ((row - 1) * columns + column - 1) / (rows * columns))
+    elif now["stage"] in ("features", "smoothed"):
+        done = text.count("Processed file [")
+    on_stage(Stage(STAGES[now["stage"]], done, total))
 
 
 def _read(folder: Path, called: Mapping[str, str]) -> Model:
-    passes, chosen = _passes(folder / "facts.json")
-    return Model(pycolmap.Reconstruction(folder), passes, called, chosen)
+    return Model(pycolmap.Reconstruction(folder), _outcome(folder / "facts.json"), called)
 
 
-def _passes(facts: Path) -> tuple[list[Outcome], int]:
-    told = json.loads(facts.read_text(encoding="utf-8"))
-    return [Outcome(**one) for one in told["passes"]], told["chosen"]
+def _outcome(facts: Path) -> Outcome:
+    return Outcome(**json.loads(facts.read_text(encoding="utf-8")))
 
 
 def key_of(what: str, pieces: Iterable[bytes]) -> str:

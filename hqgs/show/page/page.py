@@ -169,17 +169,10 @@ def page_text(
         ],
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],
-        sure=_sure(report),
         lost=[*((report.get("sfm") or {}).get("lost") or {}).items()],
         environment=_environment(report),
         config=json.dumps(report["config"], indent=1),
     )
-
-
-def _sure(report: Report) -> list[tuple[str, str]]:
-    """How sure each photo's pose is, the loosest first."""
-    sure = (report.get("sfm") or {}).get("sure_px") or {}
-    return [(name, f"{px:.2f} px") for name, px in sorted(sure.items(), key=lambda item: -item[1])]
 
 
 def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:

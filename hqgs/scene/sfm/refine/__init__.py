@@ -20,12 +20,12 @@ from hqgs.scene.constants import OUTLIER
 from hqgs.scene.sfm.refine.agree import WEAKLY_JOINT, Agreement, agreement, confirmed, loose_parts
 from hqgs.scene.sfm.refine.patches import PATCH_SIDE, PatchView, aligned, read_photos, widened
 from hqgs.scene.sfm.refine.tracks import Tracks, errors, read_tracks, rebuilt, usual
-from hqgs.scene.sfm.refine.weighted import weighted
 
 ROUNDS, FEWER = 3, 2  # of patches and adjustment; where features are precise already
 UNSURE = 0.3  # px of what SIFT sees that observations are usually off, from where on photos may be bad
 ALWAYS_CHECKED = 16  # photos, whose places are always checked
 LAID = 400  # observations of a photo, of the points whose patches are laid
+ROBUST = 2.0  # medians of the errors, from where on one counts less
 CELL = 2.0  # px, where points are the same
 GROWN = 1.3  # times: patches that leave the observations so much farther off do not fit these photos
 ANGLE = pycolmap.IncrementalMapperOptions().filter_min_tri_angle  # degrees between two rays to a point, least
@@ -36,7 +36,6 @@ Adjust = Callable[[pycolmap.Reconstruction, float, bool], None]
 class Adjusting(Protocol):
     """How models are adjusted: what COLMAP's options of a pass are needed for."""
 
-    fixed: bool  # whether focal lengths and distortion stay as they are
     threads: int
 
     def adjust(self, model: pycolmap.Reconstruction, scale: float, move: bool) -> None: ...
@@ -59,7 +58,7 @@ def refined(
     model, all_sure = plain, sure >= placed_names(plain)
     for _ in range(1 if all_sure else 2):  # weaker evidence: farther off
         rounds = ROUNDS if unsure else FEWER
-        model = sharpened(model, folder, work.adjust, not work.fixed, rounds, work.threads)
+        model = sharpened(model, folder, work.adjust, rounds, work.threads)
     if model is plain and not all_sure:
         work.settle(plain)
     whole = model.num_reg_images() == photos >= ALWAYS_CHECKED
@@ -89,17 +88,12 @@ def without(model: pycolmap.Reconstruction, names: set[str]) -> None:
 
 
 def sharpened(
-    model: pycolmap.Reconstruction,
-    folder: Path,
-    adjust: Adjust,
-    free: bool,
-    rounds: int = ROUNDS,
-    threads: int = 1,
+    model: pycolmap.Reconstruction, folder: Path, adjust: Adjust, rounds: int = ROUNDS, threads: int = 1
 ) -> pycolmap.Reconstruction:
     """The model after `rounds` of patches and adjustment; as it is where the patches do not fit.
 
     `folder` holds the photos. `adjust` gets a model, the error in px from where on it counts an error less,
-    and whether the photos move or the points alone. `free`: focal lengths and distortion are adjusted, too.
+    and whether the photos move or the points alone.
 
     The points that most photos see, LAID in each photo, make the poses precise; the others follow them.
     """
@@ -114,11 +108,12 @@ def sharpened(
         new = np.zeros(len(some.view), bool)
         if number > 0:
             some, new = widened(views, some)
-        some, sure, unlike, information = aligned(views, some, new, threads)
+        some, sure, unlike = aligned(views, some, new, threads)
         if 2 * unlike.sum() > len(names):
             return model
-        keep = some.kept(sure)
-        some, off = weighted(now, names, some.chosen(sure), information[keep], free)
+        now = rebuilt(now, names, some.chosen(sure))
+        adjust(now, ROBUST * float(np.median(errors(now))), True)
+        (_, some), off = read_tracks(now), errors(now)
         own = np.array([np.median([0, *off[some.view == k]]) for k in range(len(names))])
         some = some.chosen(off <= OUTLIER * np.maximum(own, np.median(off))[some.view])
     now = rebuilt(now, names, some)

@@ -33,7 +33,6 @@ UNLIKE = 0.3  # of a photo's observations that are sure: with fewer, patches tel
 PATCH_PHOTOS = 12  # that a point is looked for in, beside those whose features show it
 FRONTAL = 0.8  # cosine of the angle between a patch's normal and a new ray, least
 COARSER = 2.0  # px of a photo in which a point is looked for, in px of the finest that shows it, most
-ROUGH = 0.02  # of a patch's variance: what no patch fits better than, counted as noise
 
 
 def read_photo(file: Path) -> NDArray[np.float32]:
@@ -163,16 +162,14 @@ def _slopes(patches: NDArray[np.float32], mean: NDArray[np.float32]) -> Floats:
 
 def fitted(
     views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_], threads: int = 1
-) -> tuple[Floats, NDArray[np.bool_], Floats]:
-    """Where the patches of observations agree best with those of their points' other photos [O, 2], which of
-    them are sure [O], and how precisely each tells its place [O, 2, 2], 1 / px^2: by the slopes of its patch
-    and what it differs by. New ones do not count in the means.
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Where the patches of observations agree best with those of their points' other photos [O, 2], and which
+    of them are sure [O]. New ones do not count in the means.
     """
     turns, middles = _laid(views, tracks, axes_of(views, tracks))
     usable = _inside(views, tracks, turns, tracks.xy) & (middles > -1e5).all(axis=1)
     at, counted = tracks.xy, usable & ~new
     reach = REACH / np.array([view.ratio[0] for view in views])[tracks.view, None]
-    xx = xy = yy = np.zeros(len(at))
     parts = [slice(start, start + 4096) for start in range(0, max(1, len(at)), 4096)]
     with ThreadPoolExecutor(threads) as pool:
         for _ in range(PATCH_STEPS):
@@ -189,29 +186,23 @@ def fitted(
         patches = _patches(views, tracks, turns, at, pool)
     alike = (patches * _means(patches, tracks, counted) * _WEIGHTS).sum(1)
     near = (np.abs(at - tracks.xy) < reach).all(1)
-    slopes = np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2)
-    slopes /= np.maximum(2 - 2 * alike, ROUGH)[:, None, None]
-    nodes = np.linalg.inv(np.where(usable[:, None, None], turns, np.eye(2)))
-    information = np.einsum("oji,ojk,okl->oil", nodes, slopes, nodes)
-    return at, usable & near & (alike >= np.where(new, NEW, SURE)), information
+    return at, usable & near & (alike >= np.where(new, NEW, SURE))
 
 
 def aligned(
     views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_], threads: int = 1
-) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_], Floats]:
-    """Observations moved to where they are `fitted`, which of them are sure [O], which photos look unlike the
-    others [V], and the precision of each [O, 2, 2].
+) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Observations moved to where they are `fitted`, which of them are sure [O], and which photos look unlike
+    the others [V].
 
-    A photo of which few are sure is unlike: its own stay where features had them, usually precise each way.
+    A photo of which few are sure is unlike: its own stay where features had them.
     """
-    at, sure, information = fitted(views, tracks, new, threads)
+    at, sure = fitted(views, tracks, new, threads)
     known = np.bincount(tracks.view[~new], minlength=len(views))
     unlike = np.bincount(tracks.view[~new & sure], minlength=len(views)) < UNLIKE * known
     stay = unlike[tracks.view]
     at = np.where(stay[:, None], tracks.xy, at)
-    usual = np.sqrt(np.median(np.linalg.det(information[sure]))) if sure.any() else 1.0
-    information[stay] = usual * np.eye(2)
-    return replace(tracks, xy=at), np.where(stay, ~new, sure), unlike, information
+    return replace(tracks, xy=at), np.where(stay, ~new, sure), unlike
 
 
 def _candidates(

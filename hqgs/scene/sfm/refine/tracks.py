@@ -5,16 +5,11 @@ It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's pro
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-
-POSE_LEAST = 4  # observations of a photo that tell a pose and more
-RAYLEIGH = math.sqrt(2 * math.log(2))  # median distance of points in a plane that scatter by 1 each way
-
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -30,13 +25,9 @@ class Tracks:
     point: Ints
     xy: Floats
 
-    def kept(self, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which observations are `chosen` [O]."""
-        return keep & (np.bincount(self.point[keep], minlength=len(self.points)) >= 2)[self.point]
-
     def chosen(self, keep: NDArray[np.bool_]) -> Tracks:
         """Without the other observations, and without points that fewer than two see."""
-        keep = self.kept(keep)
+        keep = keep & (np.bincount(self.point[keep], minlength=len(self.points)) >= 2)[self.point]
         rows, point = np.unique(self.point[keep], return_inverse=True)
         return Tracks(self.points[rows], self.colors[rows], self.view[keep], point, self.xy[keep])
 
@@ -104,23 +95,6 @@ def usual(model: pycolmap.Reconstruction) -> float:
     _, tracks = read_tracks(model)
     length = np.bincount(tracks.point, minlength=len(tracks.points))[tracks.point]
     return float(np.median(errors(model) * np.sqrt(2 * length / (2 * length - 3))))
-
-
-def sureness(model: pycolmap.Reconstruction) -> dict[str, float]:
-    """How far off a photo may see its points by its pose alone, px (root of the mean square), by photo.
-
-    A pose has six freedoms and each observation tells two: least squares leave 3 / n of the variance of the n
-    observations in each direction. The points are taken as known, so that this is a lower limit. Photos
-    with too few observations to tell are not in it.
-    """
-    names, tracks = read_tracks(model)
-    off, common, sure = errors(model), usual(model), dict[str, float]()
-    for k, name in enumerate(names):
-        own = off[tracks.view == k]
-        if len(own) >= POSE_LEAST:
-            spread = max(common, float(np.median(own))) / RAYLEIGH
-            sure[name] = float(spread * np.sqrt(6 / len(own)))
-    return sure
 
 
 def rebuilt(model: pycolmap.Reconstruction, names: list[str], tracks: Tracks) -> pycolmap.Reconstruction:
