@@ -28,7 +28,7 @@ from hqgs.scene.sfm import run as colmap_run
 from hqgs.scene.sfm.align import rotation_angles
 from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
 from hqgs.scene.sfm.failure import Outcome, what_to_take, why_few, why_lost
-from hqgs.scene.sfm.likely import film_pairs, likely_pairs
+from hqgs.scene.sfm.likely import likely_pairs
 from hqgs.scene.sfm.passes import PASSES, Attempt, Work, best_attempt
 from hqgs.scene.sfm.photos_alone import as_stored
 
@@ -266,17 +266,6 @@ def test_a_failure_tells_blur_no_overlap_and_too_few_photos_apart() -> None:
     assert "overlap too little" in why_few(outcome(3000, [900] * 100, registered=8))
 
 
-def test_frames_of_a_film_are_matched_with_their_neighbours_and_a_few_others() -> None:
-    assert film_pairs(3).tolist() == [[0, 1], [0, 2], [1, 2]]
-    assert len(film_pairs(24)) == 24 * 23 // 2  # a short film: every pair
-    pairs = {(i, j) for i, j in film_pairs(300).tolist()}
-    assert {(i, i + k) for i in range(200) for k in (1, 2, 10, 16, 32, 64)} <= pairs
-    assert (0, 299) in pairs  # where it began and where it ended
-    assert (0, 11) not in pairs
-    assert len(pairs) < 0.12 * 300 * 299 / 2
-    assert all(i < j for i, j in pairs)
-
-
 def test_each_lost_photo_is_told_why_and_what_to_take() -> None:
     features = {"a": 900, "b": 40, "c": 800, "d": 700, "e": 900, "f": 1000, "g": 950, "h": 900}
     best = {
@@ -316,28 +305,6 @@ def test_two_captures_in_one_folder_are_told_apart(photos: list[np.ndarray], tmp
     assert set(report.lost.values()) == {"it only matches photos that have no pose either"}
     assert report.advice is not None
     assert "3 photos match each other but no others (b0.png, b1.png, b2.png)" in report.advice
-
-
-def test_only_listed_pairs_of_a_film_are_matched(photos: list[np.ndarray], tmp_path: Path) -> None:
-    for k, image in enumerate(photos):
-        Image.fromarray(image).save(tmp_path / f"{k}.png")
-    (tmp_path / "frames.json").write_text("{}")
-    found = bare_photos(tmp_path, 1)
-    assert found is not None
-    guess = readable(found).guess()
-    assert guess.ordered
-    work = tmp_path / "work"
-    (work / "photos").mkdir(parents=True)
-    found.write(work / "photos")
-    pairs = np.array([[0, 1], [1, 2], [0, 8]])
-    given = {"names": np.array(found.names), "photos": np.array(str(work / "photos")), "pairs": pairs}
-    given |= {"sizes": np.array(guess.sizes), "focals": np.array(guess.focals)}
-    given["camera_of"] = np.array(guess.camera_of)
-    one = Attempt(Work(work, given, 1), FINE)
-    one.run()
-    with pycolmap.Database.open(work / "fine.db") as db:
-        numbers = [pycolmap.pair_id_to_image_pair(pair) for pair in db.read_all_matches()[0]]
-    assert sorted(numbers) == [(1, 2), (1, 9), (2, 3)]
 
 
 def work_on(photos: list[np.ndarray], folder: Path) -> dict[str, np.ndarray]:

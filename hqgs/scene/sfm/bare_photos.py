@@ -113,7 +113,6 @@ class BarePhotos:
                 for k, size in zip(first, seen, strict=True)
             ],
             [cameras.index(k) for k in keys],
-            (self.folder / FRAMES).is_file(),
         )
 
     def write(self, folder: Path, largest: int = MOST_SIDE) -> None:

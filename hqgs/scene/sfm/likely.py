@@ -12,14 +12,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from hqgs.base.evenly import evenly
 from hqgs.base.machine import AT_ONCE
 
 LOWE_RATIO = pycolmap.FeatureMatchingOptions().sift.max_ratio  # of descriptors' distances (Lowe 2004)
 MATCHED_ALL = 60  # photos; of fewer each is matched with each
 COMPARED = 256  # features of a photo, the largest, that tell its partners
 PARTNERS, NEXT = 20, 4  # of a photo: those that are most like it, and those that follow it
-FILM_NEAR, FILM_THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
 DESCRIPTOR = 512  # length of COLMAP's descriptors, whole numbers
 
 
@@ -60,20 +58,6 @@ def partners(scores: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     first, second = np.triu_indices(count, 1)
     wanted = chosen[first, second] | (second - first <= NEXT)
     return np.stack([first[wanted], second[wanted]], axis=1)
-
-
-def film_pairs(count: int) -> NDArray[np.int64]:
-    """The pairs of frames [P, 2] that are matched, sorted; they do not grow with the frames squared.
-
-    Each frame with the next 10, and with those 16, 32, 64, ... after it, which make tracks long; and for a
-    camera that comes back to a place each with each of 24 frames that are spread over the film.
-    """
-    first, second = np.triu_indices(count, 1)
-    apart = second - first
-    thin = np.isin(np.arange(count), evenly(count, FILM_THIN))
-    near = (apart <= FILM_NEAR) | ((apart & (apart - 1)) == 0)
-    chosen = near | (thin[first] & thin[second])
-    return np.stack([first[chosen], second[chosen]], axis=1)
 
 
 def pairs_of_faces(count: int, faces: int, some: NDArray[np.int64] | None = None) -> NDArray[np.int64]:

@@ -144,8 +144,6 @@ class Work:
 
     def _pairs(self, database: Path) -> Any:
         """Pairs [P, 2] of photos that are to be matched by their features in `database`; None: all."""
-        if "pairs" in self.given:
-            return self.given["pairs"]
         pairs = None
         if len(self.names) > MATCHED_ALL:
             self.tell("matches", 0)

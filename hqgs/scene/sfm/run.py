@@ -27,7 +27,6 @@ from hqgs.base.files import keep_folder, lock_folder
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
-from hqgs.scene.sfm import likely
 from hqgs.scene.sfm.database import LEAST_PHOTOS
 from hqgs.scene.sfm.failure import Outcome, counts, doubtful, what_to_take, why_doubtful, why_few, why_lost
 
@@ -56,7 +55,6 @@ class Guess:
     sizes: list[tuple[int, int]]  # width and height of each camera
     focals: list[float]  # px; 0: not known
     camera_of: list[int]  # of each photo, the number of its camera
-    ordered: bool = False  # frames of a film: photos see what those before and after them see
     rotations: NDArray[np.float64] | None = None  # [F, 3, 3]: of each photo come F faces, whose cameras are
     # known but for their pose; maps the first one's frame into theirs
 
@@ -142,8 +140,6 @@ def run_colmap(
         given["camera_of"] = np.array(cameras.camera_of)
         if cameras.rotations is not None:
             given["rotations"] = cameras.rotations
-        if cameras.ordered:
-            given["pairs"] = likely.film_pairs(len(names))
     else:
         given["sizes"] = np.array([(camera.width, camera.height) for camera in cameras])
         given["Ks"] = np.stack([camera.K for camera in cameras])
@@ -267,6 +263,6 @@ def _pieces(names: Sequence[str], contents: Iterable[bytes], given: dict[str, An
     """Everything that the model depends on; where the photos lie is not part of it."""
     for name, content in zip(names, contents, strict=True):
         yield f"{name} {len(content)} ".encode() + content
-    for part in ("sizes", "Ks", "focals", "camera_of", "pairs", "rotations"):
+    for part in ("sizes", "Ks", "focals", "camera_of", "rotations"):
         if part in given:
             yield given[part].tobytes()
