@@ -13,9 +13,9 @@ observation the numbers of the photo and of the point: photos [O], rows [O]).
 model. Known cameras stay as they are. Of unknown ones, which are SIMPLE_RADIAL, `input.npz` has sizes [C, 2],
 focal lengths in px, focals [C], 0 where nothing is known, and the number of each photo's camera, camera_of
 [V]; where photos are faces of panoramas, the known focal lengths, and the rotations [F, 3, 3] of the F faces
-that each panorama has in `names`, one after the other. All pairs are matched, or of many photos those that are
-alike. Where it has `coarse`, photos are looked at coarsely first. The passes are those of `passes.py`, in their
-order, as long as too few photos have a place; the best one counts.
+that each panorama has in `names`, one after the other. All pairs are matched, or of many photos those that
+are alike. Where it has `coarse`, photos are looked at coarsely first. The passes are those of `passes.py`, in
+their order, as long as too few photos have a place; the best one counts.
 In the end observations are moved to where the photos agree. `facts.json` says what all came to,
 `stage.json` what is being done now, which is read from COLMAP's log: the caller sends the output to
 `log.txt`. A second call in the same DIRECTORY goes on with the features and matches that the first one left.
