@@ -1,7 +1,4 @@
-"""COLMAP's database: photos and their cameras, features and matches before their geometry is checked.
-
-It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
-"""
+"""COLMAP's database: photos and their cameras, features and matches before their geometry is checked."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What a pass of COLMAP came to, in counts.
-
-It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
-"""
+"""What a pass of COLMAP came to, in counts."""
 
 from __future__ import annotations
 

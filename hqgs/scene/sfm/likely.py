@@ -1,7 +1,4 @@
-"""Which of many photos may show the same things, so that not each has to be matched with each.
-
-It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
-"""
+"""Which of many photos may show the same things, so that not each has to be matched with each."""
 
 from __future__ import annotations
 
@@ -11,8 +8,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-
-from hqgs.base.machine import AT_ONCE
 
 LOWE_RATIO = pycolmap.FeatureMatchingOptions().sift.max_ratio  # of descriptors' distances (Lowe 2004)
 MATCHED_ALL = 60  # photos; of fewer each is matched with each
@@ -31,26 +26,14 @@ def likely_pairs(
     The numbers are whole and below 2^24, so that no order of sums and no number of threads changes a pair.
     """
     descriptors = [_largest(db, k + 1) for k in range(count)]
-    scores = np.zeros((count, count), np.int64)
-    step = max(1, AT_ONCE // max(1, *(one.size for one in descriptors)))  # photos at a time
+
+    def compare(k: int) -> list[int]:
+        own = descriptors[k]
+        return [0 if k == j else fitting(own @ other.T, DESCRIPTOR) for j, other in enumerate(descriptors)]
+
     with ThreadPoolExecutor(threads) as pool:
-        for start in range(0, count, step):
-            block = descriptors[start : start + step]
-            together = np.concatenate(block).T
-            ends = np.cumsum([len(one) for one in block])
-
-            def compare(k: int, start: int = start, together: Any = together, ends: Any = ends) -> None:
-                products = np.split(descriptors[k] @ together, ends[:-1], axis=1)
-                for other, alike in enumerate(products, start):
-                    scores[k, other] = 0 if k == other else fitting(alike, DESCRIPTOR)
-
-            list(pool.map(compare, range(count)))
-    return partners(scores + scores.T, most)
-
-
-def partners(scores: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """Pairs [P, 2] of photos, sorted: the `most` that score best with each [V, V], and those that follow."""
-    count = len(scores)
+        scores = np.array(list(pool.map(compare, range(count))), np.int64)
+    scores += scores.T
     chosen = np.zeros((count, count), bool)
     best = np.argsort(-scores, axis=1, kind="stable")[:, :most]
     np.put_along_axis(chosen, best, np.take_along_axis(scores, best, axis=1) > 0, axis=1)

@@ -27,9 +27,8 @@ def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -
     """Whether the photos are panoramas of the whole sphere (equirectangular), and those of the other kind.
 
     Panoramas say so in their files (GPano), or they are twice as wide as high, end on the right where they
-    begin on the left, and show one point along their upper and lower borders. Where files do not say so and
-    most photos are of that shape, some of them, spread over them, stand for the others. COLMAP matches no
-    face with a flat photo, so a run takes the kind that has more.
+    begin on the left, and show one point along their upper and lower borders: some, spread over those of that
+    shape, stand for the others. COLMAP matches no face with a flat photo: a run takes the kind that has more.
 
     ValueError where panoramas are parts of a sphere, or too few.
     """
@@ -37,13 +36,9 @@ def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -
     whole = [name for name, seen in looked.items() if seen.size[0] == 2 * seen.size[1]]
     found = [name for name in whole if exif[name].panorama]
     untold = [name for name in whole if exif[name].panorama is None]
-    if 2 * len(untold) > len(looked):
-        picks = [untold[k] for k in evenly(len(untold), PROBED)]
-        closed = [name for name in picks if _closes(folder / name)]
-        if 2 * len(closed) > len(picks):
-            found = whole
-    else:
-        found += [name for name in untold if _closes(folder / name)]
+    picks = [untold[k] for k in evenly(len(untold), PROBED)]
+    if 2 * sum(_closes(folder / name) for name in picks) > len(picks):
+        found += untold
     if not found and 2 * len(tagged) > len(looked):
         name = tagged[0]
         width, height = looked[name].size

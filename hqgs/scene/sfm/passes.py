@@ -1,7 +1,4 @@
-"""The passes from photos to a COLMAP model: features, matches, geometry, mapping, and how far it is.
-
-It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
-"""
+"""The passes from photos to a COLMAP model: features, matches, geometry, mapping, and how far it is."""
 
 from __future__ import annotations
 

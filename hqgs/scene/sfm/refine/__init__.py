@@ -2,8 +2,7 @@
 
 SIFT finds each of them alone, a pixel off where photos are noisy. A point's patch averaged over the photos
 that see it is cleaner than any of them, and each photo is laid against the mean of the others (Gauss-Newton
-on pixels, two unknowns). It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's
-process.
+on pixels, two unknowns).
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 Points that a photo should show are looked for in it by their patches: where its place says that they are,
 whatever features told, and beside it, where only chance lets them agree. Photos of a part that few points
 join to the rest bear each other out wherever it lies (two sides of a building look alike): there the points
-of the other parts alone are looked for. It imports of hqgs what needs nothing else: `program.py` uses it in
-COLMAP's process.
+of the other parts alone are looked for.
 """
 
 from __future__ import annotations

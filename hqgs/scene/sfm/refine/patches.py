@@ -1,7 +1,4 @@
-"""Normalised patches of a model's points in the photos that see them, and where they fit best.
-
-It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
-"""
+"""Normalised patches of a model's points in the photos that see them, and where they fit best."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from scipy.sparse import csr_array
 
 from hqgs.base.machine import AT_ONCE
 from hqgs.photos.pixels import grey
-from hqgs.scene.sfm.refine.tracks import Floats, Tracks
+from hqgs.scene.sfm.refine.tracks import Floats, Tracks, seen_at
 
 HALF = 6  # nodes of a patch to each side of its middle
 WINDOW = 3.5  # nodes, sigma of the weights over a patch
@@ -35,21 +32,21 @@ FRONTAL = 0.8  # cosine of the angle between a patch's normal and a new ray, lea
 COARSER = 2.0  # px of a photo in which a point is looked for, in px of the finest that shows it, most
 
 
-def read_photo(file: Path) -> NDArray[np.float32]:
-    """A photo, gray and smoothed, its longest side at most PATCH_SIDE px."""
-    with Image.open(file) as image:
-        gray = grey(image)
-        share = PATCH_SIDE / max(gray.size)
-        if share < 1:
-            size = max(1, round(gray.width * share)), max(1, round(gray.height * share))
-            gray = gray.resize(size, Image.Resampling.BOX)
-        return np.asarray(gaussian_filter(np.asarray(gray, np.float32), SMOOTH, mode="nearest"), np.float32)
-
-
 def read_photos(folder: Path, names: Sequence[str], threads: int) -> list[NDArray[np.float32]]:
-    """Photos of a folder, as `read_photo` has them."""
+    """Photos of a folder, gray and smoothed, their longest side at most PATCH_SIDE px."""
+
+    def read(name: str) -> NDArray[np.float32]:
+        with Image.open(folder / name) as image:
+            gray = grey(image)
+            share = PATCH_SIDE / max(gray.size)
+            if share < 1:
+                size = max(1, round(gray.width * share)), max(1, round(gray.height * share))
+                gray = gray.resize(size, Image.Resampling.BOX)
+            values = np.asarray(gray, np.float32)
+        return np.asarray(gaussian_filter(values, SMOOTH, mode="nearest"), np.float32)
+
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(lambda name: read_photo(folder / name), names))
+        return list(pool.map(read, names))
 
 
 class PatchView:
@@ -67,10 +64,8 @@ class PatchView:
 
     def project(self, points: Floats) -> tuple[Floats, Floats]:
         """Where points [N, 3] are in the photo [N, 2], and their depths [N]; behind it nowhere."""
-        inside = self.pose * points
-        front = inside[:, 2] > 1e-9
-        at = self.camera.img_from_cam(np.where(front[:, None], inside, [0.0, 0.0, 1.0]))
-        return np.where(front[:, None], at, -1e6), inside[:, 2]
+        at, depths = seen_at(self.pose, self.camera, points)
+        return np.where(np.isfinite(at), at, -1e6), depths
 
     def sample(self, at: Floats) -> NDArray[np.float32]:
         """Values [O, N] at pixels [O, 2, N] of the camera, whose middles lie at halves."""

@@ -1,11 +1,9 @@
-"""A COLMAP model's points and observations as arrays, and the model that they make.
-
-It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
-"""
+"""A COLMAP model's points and observations as arrays, and the model that they make."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -72,18 +70,23 @@ def read_tracks(model: pycolmap.Reconstruction) -> tuple[list[str], Tracks]:
     return [image.name for image in images], Tracks(points, colors, view, point, table[:, 2:])
 
 
+def seen_at(pose: Any, camera: Any, points: Floats) -> tuple[Floats, Floats]:
+    """Where a photo shows points [N, 3], px [N, 2], infinite behind it, and their depths [N]."""
+    inside = pose * points
+    front = inside[:, 2:] > 1e-9
+    at = camera.img_from_cam(np.where(front, inside, [0.0, 0.0, 1.0]))
+    return np.where(front, at, np.inf), inside[:, 2]
+
+
 def errors(model: pycolmap.Reconstruction) -> Floats:
     """Distances [O] in px between the observations of `read_tracks` and where they should be."""
     names, tracks = read_tracks(model)
     images = {image.name: image for image in model.images.values()}
     found = np.zeros(len(tracks.view))
     for k, name in enumerate(names):
-        mine = tracks.view == k
-        image = images[name]
-        inside = image.cam_from_world() * tracks.points[tracks.point[mine]]
-        front = inside[:, 2] > 0
-        at = image.camera.img_from_cam(np.where(front[:, None], inside, [0, 0, 1]))
-        found[mine] = np.where(front, np.linalg.norm(at - tracks.xy[mine], axis=1), np.inf)
+        mine, image = tracks.view == k, images[name]
+        at, _ = seen_at(image.cam_from_world(), image.camera, tracks.points[tracks.point[mine]])
+        found[mine] = np.linalg.norm(at - tracks.xy[mine], axis=1)
     return found
 
 
