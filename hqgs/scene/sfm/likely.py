@@ -27,13 +27,15 @@ def likely_pairs(
     """
     descriptors = [_largest(db, k + 1) for k in range(count)]
 
-    def compare(k: int) -> list[int]:
-        own = descriptors[k]
-        return [0 if k == j else fitting(own @ other.T, DESCRIPTOR) for j, other in enumerate(descriptors)]
+    scores = np.zeros((count, count), np.int64)
+
+    def compare(k: int) -> None:
+        for j in range(k):
+            alike = descriptors[k] @ descriptors[j].T
+            scores[k, j] = scores[j, k] = fitting(alike, DESCRIPTOR) + fitting(alike.T, DESCRIPTOR)
 
     with ThreadPoolExecutor(threads) as pool:
-        scores = np.array(list(pool.map(compare, range(count))), np.int64)
-    scores += scores.T
+        list(pool.map(compare, range(count)))
     chosen = np.zeros((count, count), bool)
     best = np.argsort(-scores, axis=1, kind="stable")[:, :most]
     np.put_along_axis(chosen, best, np.take_along_axis(scores, best, axis=1) > 0, axis=1)
