@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from pandas import DataFrame
 from benchmarks.command import Benchmark
 from benchmarks.measure import Run, Training
 from benchmarks.pages.figures import listed
-from benchmarks.protocol import Row, read_protocols
+from benchmarks.protocol import read_protocols
 from benchmarks.study import Cell, finished
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
@@ -27,16 +26,7 @@ LIMIT_MB = 1.0  # growth of the peak memory per 1,000 iterations, once the numbe
 SHORTEST = 1_000  # iterations over which such a growth can be told from chance
 
 
-@dataclass(frozen=True)
-class Case(Row):
-    """A run whose growth ends after half of it, so that the memory can be judged in the other half."""
-
-    def train_config(self, seed: int, iterations: int, changes: dict[str, Any] | None = None) -> TrainConfig:
-        config = super().train_config(seed, iterations, changes)
-        return replace(config, densify=replace(config.densify, stop=iterations // 2))
-
-
-PROTOCOLS = read_protocols(Path(__file__).with_suffix(".toml"), Case)
+PROTOCOLS = read_protocols(Path(__file__).with_suffix(".toml"))
 SHOWN = {
     "row": ("case", ""),
     "loss": ("last loss", ".4f"),

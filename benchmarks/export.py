@@ -54,16 +54,15 @@ def measure(scene: Scene, gaussians: Gaussians, folder: Path) -> list[dict[str, 
 
 
 def run(args: argparse.Namespace) -> list[str]:
-    """Train, or read a run, and write its Gaussians in every way."""
+    """Train, and write the Gaussians in every way."""
     if len(args.scenes) > 1 or len(args.seeds or ()) > 1:
         raise ValueError("one scene and one seed are written")
     protocol, (scene,) = chosen(args, PROTOCOLS)
-    folder, seed = args.run_folder, protocol.seeds[0]
-    if folder is None:
-        parts = (scene.name, f"x{protocol.downscale:g}", f"s{seed}", str(protocol.iterations), sources())
-        folder, config = args.out / "runs" / "-".join(parts), protocol.train_config(protocol.rows[0], seed)
-        if not (args.finished or hqgs.train(scene, out=folder, config=config, resume=True).finished):
-            raise KeyboardInterrupt  # the next call goes on with it
+    seed = protocol.seeds[0]
+    parts = (scene.name, f"x{protocol.downscale:g}", f"s{seed}", str(protocol.iterations), sources())
+    folder, config = args.out / "runs" / "-".join(parts), protocol.train_config(protocol.rows[0], seed)
+    if not (args.finished or hqgs.train(scene, out=folder, config=config, resume=True).finished):
+        raise KeyboardInterrupt  # the next call goes on with it
     gaussians = Gaussians.load(folder)
     with tempfile.TemporaryDirectory(dir=args.out) as name:
         rows = measure(scene, gaussians, Path(name))
@@ -72,6 +71,4 @@ def run(args: argparse.Namespace) -> list[str]:
     return [files_head(runs), files(runs)]
 
 
-HELP = "write the Gaussians of this run of the scene instead"
-OPTIONS = {"--run-folder": {"type": Path, "metavar": "DIR", "help": HELP}}
-BENCHMARK = Benchmark("the size of a scene file against its cost in held-out error", run, PROTOCOLS, OPTIONS)
+BENCHMARK = Benchmark("the size of a scene file against its cost in held-out error", run, PROTOCOLS)

@@ -78,7 +78,6 @@ class Protocol:
     seeds: tuple[int, ...] = (0,)  # of the training and of the degradation
     embedded: tuple[int, int, int] = (504, 378, 24)  # width, height in px, views of the built-in scene
     config: dict[str, Any] = field(default_factory=dict)  # changes of every row's `TrainConfig`
-    repeats: int = 1  # rounds of what is timed after the training
     photos: int | None = None  # to train on, evenly spread over those that there are; None: all
     longest: int | None = None  # px: sides of photos that are longer are scaled down
 
@@ -136,8 +135,6 @@ def narrowed(protocol: Protocol, **given: Any) -> Protocol:
     protocol = replace(protocol, **changes | {"degradations": _distinct("degradations", kinds)})
     if not protocol.downscale >= 1:
         raise ValueError(f"downscale must be at least 1, got {protocol.downscale}")
-    if protocol.repeats < 1:
-        raise ValueError(f"repeats is {protocol.repeats}, wanted at least 1")
     for seed in protocol.seeds:
         for row in protocol.rows:
             protocol.train_config(row, seed)  # its checks, before any work

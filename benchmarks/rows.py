@@ -34,42 +34,11 @@ KEYS: dict[str, Sequence[str]] = {  # of each table's lines
     "speed": ("part", "case", "threads"),
     "stability": ("case", "dtype"),
 }
-TEXT = (
-    *(
-        "study",
-        "scene",
-        "degradation",
-        "row",
-        "poses",
-        "found",
-        "file",
-        "inputs",
-        "knob",
-        "value",
-        "part",
-        "case",
-    ),
-    *(
-        "group",
-        "dtype",
-        "by",
-        "preset",
-        "stages",
-        "history",
-        "failure",
-        "machine",
-        "commit",
-        "date",
-        "sources",
-        "digest",
-        "start",
-        "what",
-        "learned",
-        "gain",
-        "gain_shown",
-        "off",
-    ),
-)
+TEXT = {  # columns whose cells are words, also where they look like numbers
+    *("study", "scene", "degradation", "row", "poses", "found", "file", "inputs", "knob", "value", "part"),
+    *("case", "group", "dtype", "by", "preset", "stages", "history", "failure", "machine", "commit", "date"),
+    *("sources", "digest", "start", "what", "learned", "gain", "gain_shown", "off"),
+}
 DIGITS = ".7g"
 
 

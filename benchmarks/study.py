@@ -202,7 +202,7 @@ def chosen(
 ) -> tuple[Protocol, list[Scene]]:
     """One of the protocols, which the options of `add_options`, and then `changes`, narrow; its scenes."""
     name = "quick" if args.quick else args.protocol
-    options = ("degradations", "rows", "seeds", "iterations", "downscale", "repeats", "photos")
+    options = ("degradations", "rows", "seeds", "iterations", "downscale", "photos")
     given = {option: vars(args).get(option) for option in options} | changes
     protocol = narrowed(protocols[name], **given)
     return protocol, load_scenes(args.scenes, protocol, args.out / "scenes", args.validate)

@@ -11,20 +11,21 @@ import torch
 from tiny_scene import tiny_scene
 
 from benchmarks import cli, protocol
-from benchmarks.endurance import PROTOCOLS, Case, run_case, verdict
+from benchmarks.endurance import PROTOCOLS, run_case, verdict
+from benchmarks.protocol import Row
 from benchmarks.rows import Table
 from hqgs.training.methods.base import ThreeDGS
 
-CASES = [row for row in PROTOCOLS["standard"].rows if isinstance(row, Case)]
+CASES = PROTOCOLS["standard"].rows
 LONG = PROTOCOLS["standard"].train_config(CASES[0], 0)
-SHORT = {"densify": {"max_gaussians": 80}}
+SHORT = {"densify": {"max_gaussians": 80, "stop": 10}}
 
 
 def call(*arguments: str | Path) -> int:
     return cli.main(["endurance", *(str(a) for a in arguments)])
 
 
-def case(name: str) -> Case:
+def case(name: str) -> Row:
     return next(c for c in CASES if c.label == name)
 
 

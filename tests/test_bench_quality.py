@@ -20,7 +20,7 @@ from benchmarks.quality.run import PROTOCOLS
 from benchmarks.rows import RUN, Table
 from benchmarks.study import PHOTOS, Cell, Study, digest_of, grid
 from hqgs.photos.formula import parse_formation
-from hqgs.scene.scene import Scene, SfmReport, View
+from hqgs.scene.scene import Scene, SfmReport
 from hqgs.training.checkpoint import scene_fingerprint
 from hqgs.training.config import SRGSConfig, TrainConfig
 from hqgs.training.trainer import TrainingError
@@ -66,8 +66,7 @@ def test_each_run_is_one_line_with_its_numbers(out: Path, runs: dict[Any, dict[s
         assert 0 < run["ssim"] < 1
         assert 0 < run["haarpsi"] < 1
         assert run["psnr_aligned"] >= run["psnr"] - 1e-3  # no gains and no tint is one of the choices
-        assert run["fall"] >= 0
-        assert min(run["seconds"], run["cpu_seconds"], run["render_ms"], run["gaussians"]) > 0
+        assert min(run["seconds"], run["cpu_seconds"], run["gaussians"]) > 0
         assert run["threads"] == 1
         assert run["sources"] == study.sources()
         assert row == "hqgs" or run["found"] == ""
@@ -118,27 +117,6 @@ def test_sheets_show_the_photo_and_every_render(out: Path, runs: dict[Any, dict[
         assert np.array_equal(sheet[line : line + 36, left : left + 48], render)
         below = sheet[2 * line + 36 + gap :, left : left + 48]
         assert np.array_equal(below, np.minimum(4 * np.abs(render - photo), 255))
-
-
-def test_a_small_sheet_shows_some_views_of_one_size_beside_their_renders(tmp_path: Path) -> None:
-    scene, width, height = tiny_scene(), 464, 348  # shown at half the size
-    view = scene.test[0]
-
-    def filled(level: int, height: int = height) -> View:
-        camera = replace(view.camera, width=width, height=height)
-        return replace(view, camera=camera, image=np.full((height, width, 3), level, np.uint8))
-
-    scene = replace(scene, test=[filled(20), filled(0, height + 40), *map(filled, (60, 100, 140, 180))])
-    for number in range(6):
-        Image.new("RGB", (width, height), (200 - 20 * number,) * 3).save(tmp_path / f"{number}.png")
-    kept = {number: {"hqgs": tmp_path / f"{number}.png"} for number in range(6)}
-    quality_cell.write_contacts(tmp_path / "all.png", scene, kept)
-    with Image.open(tmp_path / "all.png") as image:
-        assert image.width == 2 * 232 + 8
-        step = (image.height + 8) // 4  # of a line of a caption and pictures of 174 px
-        rows = [step * (k + 1) - 8 - 87 for k in range(4)]
-        levels = np.asarray(image.convert("L"))[rows][:, [116, 356]]
-    assert np.array_equal(levels, [[20, 200], [60, 160], [140, 120], [180, 100]])
 
 
 def test_finished_runs_are_not_repeated(

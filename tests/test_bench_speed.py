@@ -3,7 +3,6 @@ computation, and what it says when something is missing."""
 
 from __future__ import annotations
 
-import math
 import time
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from replay import blended_counts, random_pixels
 
 import hqgs
 from benchmarks import cli
-from benchmarks.pages.sections import power
 from benchmarks.rows import Table, pairs_of
 from benchmarks.speed.inputs import make_inputs
 from benchmarks.speed.rasterizer import RasterPass, count_work
@@ -83,26 +81,13 @@ def test_work_and_limit_follow_from_the_counts(quick: DataFrame) -> None:
         assert row["lane_use"] == pytest.approx(blended / (16 * row["blocks"]), rel=1e-4)
 
 
-def test_speed_up_growth_and_memory(quick: DataFrame) -> None:
+def test_speed_up_and_memory(quick: DataFrame) -> None:
     threads = part(quick, "threads")
     assert [r["threads"] for r in threads] == [1, 2] * 3
-    assert all(r["expected"] == pytest.approx(r["ratio"], rel=1e-6) for r in threads)
-    assert all(sum(seconds for _, seconds in pairs_of(r["stages"])) > 0 for r in threads)
     assert [r["ratio"] for r in threads if r["threads"] == 1] == [1] * 3
     assert all(0 < r["ratio"] < 20 for r in threads)
-    assert all(math.isfinite(float(power(quick, against))) for against in ("gaussians", "pixels"))
     (memory,) = part(quick, "memory")
     assert 50 < memory["imports_mb"] <= memory["scene_mb"] <= memory["peak_mb"]
-
-
-def test_the_power_is_that_of_the_case() -> None:
-    rows = [
-        {"case": f"{what}, {x}", "gaussians": x, "width": x, "height": 2, "seconds": x**exponent}
-        for what, exponent in (("gaussians", 1.3), ("pixels", 0.5))
-        for x in (4, 9)
-    ]
-    runs = DataFrame(rows).assign(part="scaling")
-    assert [power(runs, against) for against in ("gaussians", "pixels")] == ["1.30", "0.50"]
 
 
 def test_parts_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

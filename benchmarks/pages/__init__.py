@@ -1,1 +1,1 @@
-"""The pages of results, written whole from the tables: templates, what they compute, charts."""
+"""The pages of results, written whole from the tables: templates, and what they compute."""

@@ -8,9 +8,10 @@ where there is one capture. A difference within it is not called a gain.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,6 @@ from hqgs.evaluation.intervals import half_width
 
 NOTHING = "–"  # in the place of a number that there is not
 MANY = 12  # commits are counted, not listed
-NONE = "none"  # the degradation of photos that are as they were
 GROUP = [name for name in RUN if name != "row"]  # what runs share that are compared
 
 
@@ -117,27 +117,18 @@ def listed(frame: DataFrame, columns: Mapping[str, tuple[str, str]]) -> str:
 def crossed(
     frame: DataFrame,
     value: str = "psnr",
-    form: str = ".2f",
     down: str = "row",
     across: str = "degradation",
-    corner: str = "",
-    also: Mapping[str, tuple[str, str]] | None = None,
-    whole: str = "",
-    name: Callable[[str], str] = str,
+    also: Mapping[str, tuple[str, str]] = MappingProxyType({}),
 ) -> str:
-    """Means of the runs by two columns. `also`: further columns of each line, means of all of its runs;
-    `whole`: the head of the mean over all but clean photos."""
+    """Means of the runs by two columns. `also`: further columns of each line, means of all of its runs."""
     labels, heads = (list(dict.fromkeys(frame[column])) for column in (down, across))
     body = []
     for label in labels:
         part = frame.loc[frame[down] == label]
-        line = [mean(part.loc[part[across] == head], value, form) for head in heads]
-        bad = part.loc[part["degradation"] != NONE]
-        line += [mean(bad, value, form)] if whole else []
-        line += [mean(bad if whole else part, key, one) for key, (_, one) in (also or {}).items()]
-        body.append([name(str(label)), *line])
-    more = [*([whole] if whole else []), *(head for head, _ in (also or {}).values())]
-    return table([corner, *map(str, heads), *more], body)
+        line = [mean(part.loc[part[across] == head], value) for head in heads]
+        body.append([str(label), *line, *(mean(part, key, form) for key, (_, form) in also.items())])
+    return table(["", *map(str, heads), *(head for head, _ in also.values())], body)
 
 
 def gains(
@@ -215,18 +206,20 @@ def beside(
     scenes: Sequence[str] = (),
     row: str = "hqgs",
     base: str = "3dgs",
+    words: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """A row beside the base, a line for each value of `down`: its gain in each scene, in all, at worst."""
+    """A row beside the base, a line for each value of `down`: its gain in each scene, in all, at worst.
+
+    `words`: what those values are called, in their order.
+    """
     body = []
-    for label in dict.fromkeys(frame[down]):
+    for label in words or dict.fromkeys(frame[down]):
         part = frame.loc[frame[down] == label]
         whole = gain(part, row, base)
-        cells = [gain(part, row, base, scene=scene) for scene in scenes]
-        means = [mean(part.loc[part["row"] == name]) for name in (base, row)]
-        means += [one.text() for one in cells]
-        body.append(
-            [str(label), *means, whole.text(), format(whole.worst, "+.2f") if whole.count else NOTHING]
-        )
+        means = [mean(pick(part, row=name)) for name in (base, row)]
+        cells = [gain(part, row, base, scene=scene).text() for scene in scenes]
+        worst = format(whole.worst, "+.2f") if whole.count else NOTHING
+        body.append([words.get(label, str(label)), *means, *cells, whole.text(), worst])
     return table(["", f"`{base}`", f"`{row}`", *scenes, "gain", "worst run"], body)
 
 

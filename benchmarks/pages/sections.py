@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import pandas as pd
 from pandas import DataFrame
 
-from benchmarks.pages.figures import NOTHING, Gain, and_list, gain, mean, number, pick, records, table
+from benchmarks.pages.figures import NOTHING, Gain, and_list, number, pick, records, table
 from benchmarks.rows import RUN, pairs_of
-from benchmarks.speed.timing import exponent
 
 
 def stages_table(passes: DataFrame) -> str:
@@ -23,20 +22,6 @@ def stages_table(passes: DataFrame) -> str:
     return table(["Gaussians", *stages, "whole", "whole / limit", "lanes in use"], body)
 
 
-def threads_tables(runs: DataFrame) -> list[str]:
-    """Each case by stage and number of threads, and how many times as fast as one thread."""
-    tables = []
-    for case, part in runs.groupby("case", sort=False):
-        stages = [name for name, _ in pairs_of(part.iloc[0]["stages"])]
-        body = [
-            [f"{line['threads']:.0f}", *(number(value, "ms") for _, value in pairs_of(line["stages"])),
-             number(line["seconds"], "ms"), f"{line['ratio']:.2f}", f"{line['expected']:.2f}"]
-            for line in records(part)
-        ]  # fmt: skip
-        tables.append(table([str(case), *stages, "whole", "times one", "expected of two"], body))
-    return tables
-
-
 def cases_in_ms(runs: DataFrame) -> str:
     """`42 (3dgs, 100,000) and 64 (3dgs, 200,000)`."""
     return and_list([f"{number(line['seconds'], 'ms')} ({line['case']})" for line in records(runs)])
@@ -47,14 +32,6 @@ def threads_words(runs: DataFrame) -> str:
     many = runs.loc[runs["threads"] == 2]
     words = [f"{line['ratio']:.2f} ({line['case']})" for line in records(many)]
     return f"two are so many times as fast as one: {and_list(words)}" if words else "there was one"
-
-
-def power(speed: DataFrame, against: str) -> str:
-    """The power with which the time of a pass grows with `gaussians` or `pixels`."""
-    runs = pick(speed, part="scaling")
-    runs = runs.loc[runs["case"].str.startswith(against)]
-    x = runs["gaussians"] if against == "gaussians" else runs["width"] * runs["height"]
-    return f"{exponent(list(x), list(runs['seconds'])):.2f}"
 
 
 def unbeaten_default(accuracy: DataFrame) -> str:
@@ -240,17 +217,6 @@ def files_head(export: DataFrame) -> str:
     size = f"{first['width']:,} x {first['height']:,} px"
     what = f"{first['gaussians']:,} Gaussians of degree {first['sh_degree']}"
     return f"{first['scene'].capitalize()}, {size}, {what}."
-
-
-def like_mine(runs: DataFrame, kinds: Sequence[str], words: Sequence[str]) -> str:
-    """What `hqgs` gains on each kind of photos, as its user would call them."""
-    body = []
-    for kind, word in zip(kinds, words, strict=True):
-        part = pick(runs, degradation=kind)
-        both = [mean(pick(part, row=row)) for row in ("3dgs", "hqgs")]
-        found = gain(part, "hqgs", "3dgs")
-        body.append([word, kind, *both, found.text(), f"{found.worst:+.2f}"])
-    return table(["your photos", "in the test", "`3dgs`", "`hqgs`", "gain", "worst run"], body)
 
 
 def seeds_apart(quality: DataFrame, row: str = BASE) -> float:

@@ -1,4 +1,4 @@
-"""`pages`: the pages of results and their charts, written whole from the tables."""
+"""`pages`: the pages of results, written whole from the tables."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from benchmarks import looks, parts, stages
-from benchmarks.pages import charts, figures, sections
+from benchmarks.pages import figures, sections
 from benchmarks.protocol import read_toml
 from benchmarks.rows import KEYS, Table
-from hqgs.base.files import atomic_path, write_text
+from hqgs.base.files import write_text
 
 HERE = Path(__file__).parent
 STUDIES: dict[str, str] = read_toml(HERE.parent / "studies.toml")["studies"]
@@ -65,16 +65,11 @@ def pages(folder: Path) -> dict[Path, str]:
 
 
 def write(folder: Path, docs: Path) -> list[Path]:
-    """Write pages and charts of the tables in `folder` into `docs`; returns their paths."""
-    written = []
-    for path, text in pages(folder).items():
+    """Write the pages of the tables in `folder` into `docs`; returns their paths."""
+    found = pages(folder)
+    for path, text in found.items():
         write_text(docs / path, text)
-        written.append(docs / path)
-    for name, figure in charts.charts(tables(folder)).items():
-        written.append(docs / "images" / f"{name}.png")
-        with atomic_path(written[-1]) as tmp:
-            figure.savefig(tmp)
-    return written
+    return [docs / path for path in found]
 
 
 def add_docs(parser: argparse.ArgumentParser) -> None:

@@ -9,13 +9,13 @@ from typing import Any
 from benchmarks.command import Benchmark
 from benchmarks.pages.figures import crossed, gains
 from benchmarks.protocol import read_protocols
-from benchmarks.quality.cell import reconstruction, run_cell, write_contacts, write_sheet
+from benchmarks.quality.cell import reconstruction, run_cell, write_sheet
 from benchmarks.rows import Table, facts
 from benchmarks.study import Cell, Study, begin
 from hqgs.scene.scene import Scene
 
 PROTOCOLS = read_protocols(Path(__file__).parent / "protocols.toml")
-ALSO = {"ssim": ("SSIM", ".3f"), "fall": ("below its best (dB)", ".2f")}
+ALSO = {"ssim": ("SSIM", ".3f")}
 POSES = "poses.csv"  # what `--sfm` found
 
 
@@ -56,17 +56,12 @@ class Quality:
         for (name, kind, seed), cells in groups.items():
             if any(cell not in self.study.runs for cell in cells):
                 continue
-            scene, kept = cells[0].scene, dict[int, dict[str, Path]]()
-            stem = self.args.out / "pictures" / f"{name}-{kind.replace(':', '_')}-s{seed}"
+            scene, folder = cells[0].scene, self.args.out / "pictures"
             for number in range(min(self.args.pictures, len(scene.test))):
-                path = stem.with_name(f"{stem.name}-{number}.png")
+                path = folder / f"{name}-{kind.replace(':', '_')}-s{seed}-{number}.png"
                 renders = {cell.row.label: self.render(cell, number) for cell in cells}
-                if write_sheet(path, scene, kind, seed, renders, number):
-                    kept[number] = renders
-                else:
+                if not write_sheet(path, scene, kind, seed, renders, number):
                     lost.append(f"left out: picture {path.name}: the runs did not keep its renders")
-            if len(kept) > 1:
-                write_contacts(stem.with_name(f"{stem.name}.png"), scene, kept)
         return lost
 
     def tables(self) -> list[str]:
@@ -106,7 +101,7 @@ def run(args: argparse.Namespace) -> list[str]:
 
 FIT = "measure a second time with each held-out camera fitted to the trained scene, as --sfm does"
 SFM = "poses and points from the degraded photos, the same for all rows"
-PICTURES = "sheets per scene and degradation, and a small one of some of them"
+PICTURES = "sheets per scene and degradation"
 OPTIONS: dict[str, dict[str, Any]] = {
     "--degradations": {"nargs": "+", "metavar": "KIND", "help": "instead of the protocol's"},
     "--validate": {"action": "store_true", "help": "for tuning: judge on training photos, not on test views"},

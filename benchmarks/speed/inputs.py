@@ -55,10 +55,6 @@ class RasterInputs:
     def height(self) -> int:
         return self.v_image.shape[0]
 
-    def first(self, n: int) -> RasterInputs:
-        """With so many Gaussians; the arrays are shared."""
-        return replace(self, **{name: getattr(self, name)[:n] for name in LEAVES})
-
 
 def make_inputs(n: int, width: int = SIZE[0], height: int = SIZE[1], seed: int = 2026) -> RasterInputs:
     """N Gaussians, uniform in the volume that a camera of this size sees between two depths.
@@ -78,27 +74,20 @@ def make_inputs(n: int, width: int = SIZE[0], height: int = SIZE[1], seed: int =
     quats = rng.standard_normal((n, 4))
     sh = 0.1 * rng.standard_normal((n, 16, 3), dtype=np.float32)
     sh[:, 0] = (rng.random((n, 3)) - 0.5) / SH_C0
+    focal = FOCAL * width / SIZE[0]
+    v_image = np.random.default_rng(n).standard_normal((height, width, 3), dtype=np.float32)
     inputs = RasterInputs(
         means=_f32((np.stack([x * z, y * z, z], axis=1) - viewmat[:3, 3]) @ viewmat[:3, :3]),
         quats=_f32(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
         scales=_f32(np.exp(0.5 * rng.standard_normal((n, 3)))),
         opacities=_f32(1 / (1 + np.exp(0.5 - 1.5 * rng.standard_normal(n)))),
         sh=sh,
-        v_image=np.zeros((1, 1, 3), np.float32),
+        v_image=_f32(v_image / np.float32(v_image.size)),
         viewmat=viewmat,
-        K=np.eye(3),
+        K=np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]),
         background=_f32([0.1, 0.2, 0.3]),
     )
-    return fitted(inputs, n, width, height)
-
-
-def fitted(inputs: RasterInputs, n: int, width: int, height: int) -> RasterInputs:
-    """The first `n` Gaussians with the image and the overlap of `make_inputs`; other arrays are shared."""
-    focal = FOCAL * width / SIZE[0]
-    v_image = np.random.default_rng(n).standard_normal((height, width, 3), dtype=np.float32)
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    first = replace(inputs.first(n), v_image=v_image / np.float32(v_image.size), K=K)
-    return replace(first, scales=first.scales * np.float32(_size(first)))
+    return replace(inputs, scales=inputs.scales * np.float32(_size(inputs)))
 
 
 def _size(inputs: RasterInputs) -> float:
@@ -106,7 +95,7 @@ def _size(inputs: RasterInputs) -> float:
 
     A support is the ellipse where alpha >= 1/255: 2 pi ln(255 opacity) sqrt(det(cov2d)) square pixels.
     """
-    sample = inputs.first(SAMPLE)
+    sample = replace(inputs, **{name: getattr(inputs, name)[:SAMPLE] for name in LEAVES})
     _, _, cov = project(sample)
     reach2 = 2 * np.log(np.maximum(sample.opacities.astype(np.float64) / ALPHA_MIN, 1))
     area = (1 + 2 * MARGIN) ** 2 * inputs.width * inputs.height

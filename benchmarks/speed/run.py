@@ -12,27 +12,18 @@ from typing import Any
 import hqgs
 from benchmarks.command import TIMED, Benchmark, UnavailableError, sizes_of
 from benchmarks.pages.figures import listed, pick
-from benchmarks.pages.sections import power, stages_table, threads_tables
+from benchmarks.pages.sections import stages_table
 from benchmarks.protocol import read_toml
 from benchmarks.rows import Table, facts
-from benchmarks.speed.inputs import RasterInputs, fitted, make_inputs
-from benchmarks.speed.rasterizer import BIN, RasterPass, measure
-from benchmarks.speed.timing import (
-    Seconds,
-    busy_core,
-    expected_ratio,
-    interleaved,
-    median_ratio,
-    using_threads,
-    warmed,
-    whole,
-)
-from benchmarks.speed.training import make_trainer, measure_memory, measure_steps, step_by_parts
+from benchmarks.speed.inputs import RasterInputs, make_inputs
+from benchmarks.speed.rasterizer import RasterPass, measure
+from benchmarks.speed.timing import Seconds, interleaved, median_ratio, using_threads, warmed, whole
+from benchmarks.speed.training import make_trainer, measure_memory, measure_steps, whole_step
 from hqgs.training.config import METHODS, PAPER, HQGSConfig, check_method
 from hqgs.training.trainer import Trainer
 
 DATA = read_toml(Path(__file__).with_name("speed.toml"))
-PARTS = ("rasterizer", "busy", "step", "formations", "threads", "scaling", "memory")
+PARTS = ("rasterizer", "step", "formations", "threads", "memory")
 SHOWN = {
     "part": ("", ""),
     "case": ("case", ""),
@@ -70,22 +61,6 @@ class Speed:
     def rasterizer(self) -> Rows:
         return measure(self.inputs, self.repeats)
 
-    def busy(self) -> Rows:
-        """The same beside a process that takes a core; `ratio`: of the time without."""
-        cases = {f"{len(x):,}": RasterPass(x) for x in self.inputs}
-        jobs = {(name, False): warmed(case) for name, case in cases.items()}
-        jobs |= {(name, True): warmed(case, busy_core) for name, case in cases.items()}
-        measured = interleaved(jobs, self.repeats)
-        return [
-            {
-                "case": f"{name}, a core busy",
-                **whole(rounds),
-                "ratio": median_ratio(rounds, measured[name, False]),
-            }
-            for (name, busy), rounds in measured.items()
-            if busy
-        ]
-
     def step(self, trainers: dict[str, Trainer] | None = None) -> Rows:
         return measure_steps(trainers or self.trainers, self.repeats)
 
@@ -97,17 +72,14 @@ class Speed:
         return self.step({f"3dgs, {n:,}": self._trainer(n, "3dgs")} | trainers)
 
     def threads(self) -> Rows:
-        """All sizes and a step with 1, 2, 4, ... threads and with all.
-
-        `ratio`: how many times as fast as with one; `expected`: what follows of one and two.
-        """
+        """All sizes and a step with 1, 2, 4, ... threads and all; `ratio`: how many times as fast as one."""
         if hqgs.get_num_threads() == 1:
             raise UnavailableError("there is one thread")
         trainer = next(iter(self.trainers.values()))
         cases: dict[str, Callable[[], Seconds]] = {
             f"rasterizer, {len(x):,} Gaussians": RasterPass(x) for x in self.inputs
         }
-        cases[f"training step, {len(trainer.gaussians):,} Gaussians"] = step_by_parts(trainer)
+        cases[f"training step, {len(trainer.gaussians):,} Gaussians"] = whole_step(trainer)
         most = hqgs.get_num_threads()
         counts = sorted({most, *(1 << k for k in range(most.bit_length()))})
         jobs = {
@@ -121,32 +93,9 @@ class Speed:
                 "case": name,
                 **whole(rounds),
                 "ratio": median_ratio(measured[name, 1], rounds),
-                "expected": expected_ratio(median_ratio(measured[name, 1], measured[name, 2]), count),
                 "threads": count,
-                "stages": rounds.drop(columns=["total", BIN], errors="ignore").median().to_dict(),
             }
             for (name, count), rounds in measured.items()
-        ]
-
-    def scaling(self) -> Rows:
-        """Time against the number of Gaussians in one image, and of so many against the size of the image.
-
-        The overlap per pixel is the same everywhere.
-        """
-        sizes, image, images, n = (
-            self.config["scaling"][name] for name in ("sizes", "image", "images", "gaussians")
-        )
-        cloud = make_inputs(max(sizes), *image, seed=self.seed)  # the smaller ones share its memory
-        rows = self._curve({f"gaussians, {size:,}": fitted(cloud, size, *image) for size in sizes})
-        cloud = make_inputs(n, *images[0], seed=self.seed)
-        return rows + self._curve({f"pixels, {w * h:,}": fitted(cloud, n, w, h) for w, h in images})
-
-    def _curve(self, inputs: dict[str, RasterInputs]) -> Rows:
-        """Seconds of passes."""
-        measured = interleaved({name: warmed(RasterPass(x)) for name, x in inputs.items()}, self.repeats)
-        return [
-            {"case": name, "gaussians": len(x), "width": x.width, "height": x.height, **whole(measured[name])}
-            for name, x in inputs.items()
         ]
 
     def memory(self) -> Rows:
@@ -182,11 +131,6 @@ def run(args: argparse.Namespace) -> list[str]:
     tables = [listed(runs, {name: how for name, how in SHOWN.items() if name in runs})]
     if "rasterizer" in args.parts:
         tables.append(stages_table(pick(runs, part="rasterizer")))
-    if "threads" in runs["part"].values:
-        tables += threads_tables(pick(runs, part="threads"))
-    if "scaling" in args.parts:
-        powers = f"{power(runs, 'gaussians')} with the Gaussians, {power(runs, 'pixels')} with the pixels"
-        tables.append(f"Power with which the time grows: {powers}.")
     return [*tables, *words]
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import gc
-import subprocess
-import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
 from typing import Any, TypeVar
 from unittest.mock import patch
@@ -64,16 +62,6 @@ def using_threads(count: int) -> Iterator[None]:
         hqgs.set_num_threads(before)
 
 
-@contextmanager
-def busy_core() -> Iterator[None]:
-    """Inside it another process takes a core."""
-    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
-        try:
-            yield
-        finally:
-            process.kill()
-
-
 def quartiles(values: Any) -> list[float]:
     """The values below which a quarter and three quarters of them lie."""
     return np.quantile(values, [0.25, 0.75]).tolist()
@@ -84,22 +72,10 @@ def median_ratio(rounds: DataFrame, others: DataFrame) -> float:
     return float((rounds["total"] / others["total"]).median())
 
 
-def expected_ratio(two: float, threads: int) -> float:
-    """How many times as fast as one thread so many are, where two are `two` times as fast and a share of the
-    work is for one thread alone (Amdahl 1967)."""
-    serial = 2 / two - 1
-    return 1 / (serial + (1 - serial) / threads)
-
-
 def whole(rounds: DataFrame) -> dict[str, float]:
     """Median and quartiles of the whole, as columns."""
     low, high = quartiles(rounds["total"])
     return {"seconds": float(rounds["total"].median()), "seconds_low": low, "seconds_high": high}
-
-
-def exponent(x: Sequence[float], seconds: Sequence[float]) -> float:
-    """The power of x with which the time grows: slope of the line through (log x, log seconds)."""
-    return float(np.polyfit(np.log(x), np.log(seconds), 1)[0])
 
 
 class StageClock:

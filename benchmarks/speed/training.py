@@ -137,8 +137,7 @@ def step_by_parts(trainer: Trainer) -> Callable[[], Seconds]:
 
 
 def measure_steps(trainers: Mapping[str, Trainer], repeats: int) -> list[dict[str, Any]]:
-    """Seconds of a step, and of each part of it, for each trainer; `case` is its key, `ratio` is over the
-    first one, `clocked` how much the clocks slow the step down."""
+    """Seconds of a step and of its parts, for each trainer; `case`: its key, `ratio`: over the first one."""
     ways = {"whole": whole_step, "parts": step_by_parts}
     cases = {(name, way): time(t) for name, t in trainers.items() for way, time in ways.items()}
     measured = interleaved(cases, repeats)
@@ -147,6 +146,6 @@ def measure_steps(trainers: Mapping[str, Trainer], repeats: int) -> list[dict[st
         camera, n = trainer.scene.train[0].camera, len(trainer.gaussians)
         rounds, parts = measured[name, "whole"], measured[name, "parts"]
         row = {"case": name, "gaussians": n, "width": camera.width, "height": camera.height}
-        row |= whole(rounds) | {"ratio": median_ratio(rounds, first), "clocked": median_ratio(parts, rounds)}
+        row |= whole(rounds) | {"ratio": median_ratio(rounds, first)}
         rows.append(row | {"stages": parts.drop(columns="total").median().to_dict()})
     return rows

@@ -185,12 +185,6 @@ def misses(case: Case, outcome: Outcome) -> list[str]:
     return [words for words, is_so in missed.items() if is_so]
 
 
-def input_rounding(case: Case) -> float:
-    """Largest change of any compared value that rounding the inputs to float32 alone causes."""
-    exact, rounded = Oracle(case.scene), Oracle(case.scene.rounded("f32"))
-    return value_errors(*([oracle.pixel(p) for p in case.pixels] for oracle in (exact, rounded)))[0]
-
-
 def line_of(case: Case, outcome: Outcome) -> dict[str, Any]:
     """The columns of its line: where targets are missed, with what an ulp of the inputs changes. Inputs that
     are not finite have no oracle."""
