@@ -22,7 +22,6 @@ from benchmarks.rows import RUN
 from hqgs.evaluation.intervals import half_width
 
 NOTHING = "–"  # in the place of a number that there is not
-MANY = 12  # commits are counted, not listed
 GROUP = [name for name in RUN if name != "row"]  # what runs share that are compared
 
 
@@ -182,12 +181,7 @@ def made(*frames: DataFrame) -> str:
     dates = sorted({date for date in runs["date"] if date})
     when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
     machines = and_list(sorted({machine for machine in runs["machine"] if machine}))
-    several = (
-        f"{len(commits)} commits, {commits[0]} to {commits[-1]}"
-        if len(commits) > MANY
-        else f"commit{'s' * (len(commits) > 1)} {', '.join(commits)}"
-    )
-    text = f"{len(runs)} lines; {several}; {machines}; {when}."
+    text = f"{len(runs)} lines; commit{'s' * (len(commits) > 1)} {', '.join(commits)}; {machines}; {when}."
     mixed = " Not of one commit and machine: cells compare roughly."
     return text + (mixed if len(commits) > 1 else "")
 

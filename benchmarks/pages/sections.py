@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pandas as pd
 from pandas import DataFrame
 
-from benchmarks.pages.figures import NOTHING, Gain, and_list, number, pick, records, table
+from benchmarks.pages.figures import NOTHING, and_list, number, pick, records, table
 from benchmarks.rows import RUN, pairs_of
 
 
@@ -81,10 +81,22 @@ SHORT = 0.1  # dB: a level is what 3DGS ends at, less this
 BASE = "3dgs"
 
 
-def then(history: str, seconds: float) -> float | None:
-    """The PSNR of a run after so many of its seconds; None before its first evaluation."""
-    known = [psnr for at, psnr in pairs_of(history) if float(at) <= seconds]
-    return known[-1] if known else None
+def beside_base(times: DataFrame) -> DataFrame:
+    """The runs that had a number of seconds, by it, with their `lead` over BASE after as many of its own.
+
+    `base`: its PSNR then, NaN before its first evaluation.
+    """
+    histories = pick(times, row=BASE).set_index("scene")["history"].map(pairs_of)
+    runs = pick(times, row=[row for row in set(times["row"]) if row != BASE])
+    runs = runs.assign(asked=runs["row"].str.removesuffix(" s").astype(float)).sort_values(
+        "asked", kind="stable"
+    )
+    known = [
+        [psnr for at, psnr in histories[scene] if float(at) <= asked]
+        for scene, asked in zip(runs["scene"], runs["asked"], strict=True)
+    ]
+    runs["base"] = [psnrs[-1] if psnrs else None for psnrs in known]
+    return runs.assign(lead=runs["psnr"] - runs["base"])
 
 
 def placed(poses: DataFrame) -> str:
@@ -144,48 +156,6 @@ def reconstructions(poses: DataFrame) -> str:
     return table(["", *first, "CPU (s)"], rows)
 
 
-def after(times: DataFrame, scene: str, row: str, seconds: float) -> float | None:
-    """The mean PSNR of the row's runs after so many of their seconds."""
-    known = [then(history, seconds) for history in pick(times, scene=scene, row=row)["history"]]
-    found = [value for value in known if value is not None]
-    return sum(found) / len(found) if found else None
-
-
-def asked(times: DataFrame) -> list[str]:
-    """The rows that had a number of seconds, by it: `30 s`."""
-    return sorted((row for row in set(times["row"]) if row.endswith(" s")), key=seconds_of)
-
-
-def seconds_of(row: str) -> float:
-    return float(row.removesuffix(" s"))
-
-
-def over_time(times: DataFrame, scenes: Sequence[str], against: str = "") -> str:
-    """PSNR after the seconds that were asked for, a line for each scene; `against`: its gain over that row
-    at as many of its own seconds."""
-    rows, body = asked(pick(times, scene=list(scenes))), []
-    for scene in scenes:
-        line = []
-        for row in rows:
-            mine = pick(times, scene=scene, row=row)
-            other = after(times, scene, against, seconds_of(row)) if against else 0.0
-            known = len(mine) > 0 and other is not None
-            form = "+.2f" if against else ".2f"
-            line.append(format(mine["psnr"].mean() - other, form) if known else NOTHING)
-        body.append([scene, *line])
-    return table(["", *rows], body)
-
-
-def lead(times: DataFrame, row: str, scenes: Sequence[str], against: str = BASE) -> Gain:
-    """Of the row over another one at as many of its own seconds, over the scenes."""
-    found = []
-    for line in records(pick(times, row=row, scene=scenes)):
-        other = after(times, line["scene"], against, seconds_of(row))
-        if other is not None:
-            found.append({"scene": line["scene"], "gain": line["psnr"] - other})
-    return Gain(DataFrame(found, columns=["scene", "gain"]), against)
-
-
 def levels(times: DataFrame, scenes: Sequence[str], base: str = BASE) -> str:
     """When each scene comes within SHORT of where the base ends, and when the base itself does, a line each;
     what precedes the first step counts."""
@@ -193,7 +163,7 @@ def levels(times: DataFrame, scenes: Sequence[str], base: str = BASE) -> str:
     for scene in scenes:
         for line in records(pick(times, scene=scene, row=base)):
             level = line["psnr"] - SHORT
-            mine = pick(times, scene=scene, row=asked(times))
+            mine = times.loc[(times["scene"] == scene) & (times["row"] != base)]
             enough = (mine["seconds"] + mine["setup_seconds"]).loc[mine["psnr"] >= level]
             own = min(float(at) for at, psnr in pairs_of(line["history"]) if psnr >= level)
             took = f"{enough.min():.0f}" if len(enough) else NOTHING
