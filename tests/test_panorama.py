@@ -16,10 +16,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 from test_diagnose import clean_photo
 
-from benchmarks.scenes.panorama import panorama_room
 from hqgs.base.stages import Stage
 from hqgs.diagnosis.differences import TURNED, unlike_sharpness
-from hqgs.evaluation.metrics import psnr
 from hqgs.photos.exif import read_exif
 from hqgs.scene import views
 from hqgs.scene.faces import CUBE, around, face_name, faces_of
@@ -335,27 +333,6 @@ def test_faces_that_were_resampled_differently_are_not_shaken() -> None:
     assert found is not None
     assert shaken is not None
     assert found[1] < TURNED < shaken[1]
-
-
-def test_the_room_as_panoramas() -> None:
-    """What goes over a panorama is what a pinhole sees, but for what its pixels are too coarse for."""
-    room = panorama_room(width=64, places=2)
-    assert [view.name for view in room.scene.test] == [
-        f"panorama_00.{face}.png" for face in CUBE if face != "back"
-    ]
-    assert [view.name for view in room.scene.train] == [f"panorama_01.{face}.png" for face in CUBE]
-    for view, clean in zip(room.scene.train, room.clean.train, strict=True):
-        found = psnr(view.image, clean.image)
-        assert found is not None
-        assert found > 23
-        soft = [
-            gaussian_filter(image.astype(np.float64), (1.5, 1.5, 0)) for image in (view.image, clean.image)
-        ]
-        assert np.abs(soft[0] - soft[1])[4:-4, 4:-4].mean() < 3
-    with pytest.raises(ValueError, match="places is 1"):
-        panorama_room(places=1)
-    with pytest.raises(ValueError, match="width is 97"):
-        panorama_room(width=97)
 
 
 @pytest.mark.slow

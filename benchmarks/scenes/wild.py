@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -96,30 +95,18 @@ def wild_room(
         for view in clean.train
     }
     made = {"kind": name, "value": value, "seed": seed, "size": [width, height], "num_views": num_views}
-    photos = kept_photos(
-        None if cache is None else cache / f"{name}_{value:g}_{seed}.npz",
-        made,
-        lambda: {view.name: taken(name, view.camera, truth[view.name]) for view in clean.train},
-    )
+    file = None if cache is None else cache / f"{name}_{value:g}_{seed}.npz"
+    photos = None if file is None else kept(file, made)
+    if photos is None:
+        photos = {view.name: taken(name, view.camera, truth[view.name]) for view in clean.train}
+        if file is not None:
+            keep(file, made, photos)
     note = (
         f"photographed with {name}:{value:g}, seed {seed}: all training photos ({len(clean.train)}), "
         f"ray-cast in linear light; held-out photos ({len(clean.test)}) are clean; points and poses are exact"
     )
     train = [replace(view, image=photos[view.name]) for view in clean.train]
     return WildRoom(replace(clean, train=train, notes=[*clean.notes, note]), clean, truth)
-
-
-def kept_photos(
-    file: Path | None, made: Mapping[str, Any], make: Callable[[], dict[str, NDArray[np.uint8]]]
-) -> dict[str, NDArray[np.uint8]]:
-    """Photos by name, from the file where they are there, made as `made` says."""
-    found = None if file is None else kept(file, made)
-    if found is None:
-        found = make()
-        if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            keep(file, made, found)
-    return found
 
 
 def parse_true_kind(text: str, width: int = WIDTH) -> tuple[str, float]:

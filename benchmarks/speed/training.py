@@ -37,47 +37,31 @@ def make_trainer(
     options: HQGSConfig | None = None,
     warm: bool = False,
 ) -> Trainer:
-    """A `still_trainer` that holds the Gaussians of `make_inputs`. `options`: of method hqgs.
+    """A trainer at the Gaussians of `make_inputs` whose steps do all the work of a step, the statistics for
+    their number included, but change next to nothing.
 
-    Raises ValueError as `make_inputs` and `Trainer` do.
+    `options`: of method hqgs. `warm`: it has made the steps until all harmonics are trained. ValueError as
+    `make_inputs` and `Trainer` have it.
     """
-    inputs = make_inputs(gaussians, width, height, seed)
+    inputs, iterations = make_inputs(gaussians, width, height, seed), 1_000_000
     rng = np.random.default_rng(seed)
     views = [
         View(f"{k:03d}", camera, rng.integers(0, 256, (height, width, 3), dtype=np.uint8))
         for k, camera in enumerate(_cameras(inputs, photos, rng))
     ]
     scene = Scene("cloud", views, [], inputs.means, np.zeros(inputs.means.shape, np.uint8), "benchmark")
-    config = TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig(), leave_out=())
+    still = DensifyConfig(start=iterations, stop=iterations, reset_every=iterations, max_gaussians=gaussians)
+    given: dict[str, Any] = {"hqgs": options or HQGSConfig(), "leave_out": (), "densify": still}
+    config = TrainConfig(iterations, method, seed, sh_interval=1, **given)
+    config = replace(config, **{name: TINY for name in vars(config) if name.startswith("lr_")})
+    trainer = Trainer(scene, config)
     means, quats, scales, opacities, sh = (torch.from_numpy(getattr(inputs, name)) for name in LEAVES)
     start = Gaussians(means, scales.log(), quats, opacities.logit(), sh[:, :1], sh[:, 1:])
-    return still_trainer(scene, config, start, warm)
-
-
-def still_trainer(scene: Scene, config: TrainConfig, gaussians: Gaussians, warm: bool = True) -> Trainer:
-    """A trainer at these Gaussians whose steps do all the work of a step, the statistics for their number
-    included, but change next to nothing. `warm`: it has made the steps until all harmonics are trained."""
-    iterations, n = 1_000_000, max(len(gaussians), 1)
-    still = replace(
-        config,
-        iterations=iterations,
-        sh_interval=1,
-        **{name: TINY for name in vars(config) if name.startswith("lr_")},
-        densify=DensifyConfig(start=iterations, stop=iterations, reset_every=iterations, max_gaussians=n),
-    )
-    trainer = trainer_from(scene, still, gaussians)
-    for _ in range(config.sh_degree if warm else 0):
-        trainer.step()
-    return trainer
-
-
-def trainer_from(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Trainer:
-    """A trainer that starts with these Gaussians in place of the scene's points."""
-    points = gaussians.means.numpy()
-    trainer = Trainer(replace(scene, points=points, point_colors=np.zeros(points.shape, np.uint8)), config)
     with torch.no_grad():
         for name, tensor in trainer.gaussians.named().items():
-            tensor.copy_(getattr(gaussians, name))
+            tensor.copy_(getattr(start, name))
+    for _ in range(config.sh_degree if warm else 0):
+        trainer.step()
     return trainer
 
 

@@ -54,13 +54,11 @@ def assemble(
     cache: Path | None,
     made: dict[str, Any],
     held_out: Mapping[int, str] | None = None,
-    names: Sequence[str] | None = None,
 ) -> Scene:
     """A scene of clean photos of the room by these cameras; points from those that are trained on.
 
     `made` says what cameras depend on beside the photos' size and number, in JSON values, for the key of the
-    cache. `held_out`: numbers of the test views, and what they are
-    called; None: every 8th. `names`: of all views, in place of `view_NN.png` and such. ValueError for
+    cache. `held_out`: numbers of the test views, and what they are called; None: every 8th. ValueError for
     cameras below 1 x 1.
     """
     width, height = cameras[0].width, cameras[0].height
@@ -70,8 +68,7 @@ def assemble(
         held_out = dict.fromkeys(range(0, len(cameras), TEST_EVERY), "view")
     if cache is not None:
         cache.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
-    if names is None:
-        names = [f"{held_out.get(k, 'view')}_{k:02d}.png" for k in range(len(cameras))]
+    names = [f"{held_out.get(k, 'view')}_{k:02d}.png" for k in range(len(cameras))]
     made = {"width": width, "height": height, "num_views": len(cameras), **made}
     file = None if cache is None else cache / "room.npz"
     found = None if file is None else kept(file, made)
