@@ -275,4 +275,3 @@ def add_options(parser: argparse.ArgumentParser, protocols: Mapping[str, Protoco
         help="train on K of the photos, by the split of the few-photo papers",
     )
     add("--finished", action="store_true", help="train nothing: tables of the runs that are finished")
-    add("--known", action="store_true", help="runs of other sources count as finished, too")

@@ -127,13 +127,12 @@ class Study:
         self.digests = {cell: digest_of(cell, prints[cell.scene.name]) for cell in self.cells}
         lines = self.table.lines()
         found = {cell: lines.get(self.table.key_of(cell.key)) for cell in self.cells}
-        self.runs = {cell: line for cell, line in found.items() if line and self._counts(cell, line)}
+        self.runs = {
+            cell: line
+            for cell, line in found.items()
+            if line and (line.get("digest"), line.get("sources")) == (self.digests[cell], sources())
+        }
         self.failures: dict[Cell, str] = {}
-
-    def _counts(self, cell: Cell, line: Mapping[str, str]) -> bool:
-        """Whether the line is of this run; of other sources only with `--known`."""
-        same = line.get("digest") == self.digests[cell]
-        return same and (self.args.known or line.get("sources") == sources())
 
     def train(self, measure: Callable[[Cell, Scene], Run]) -> None:
         """Run the cells that are not finished, in their order; each is written as soon as it is done.

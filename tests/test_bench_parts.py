@@ -265,7 +265,6 @@ def test_a_quick_run_has_a_line_for_each_row(tmp_path: Path, capsys: pytest.Capt
     [
         ("accuracy --quick --repeats 0", "repeats is 0, wanted at least 1"),
         ("speed --quick --repeats 0", "repeats is 0, wanted at least 1"),
-        ("speed --quick --method 4dgs", "unknown method '4dgs'"),
         ("speed --quick --threads 0", "threads"),
         ("export --scenes a b", "one scene and one seed are written"),
         ("export --iterations 0", "iterations is 0, wanted at least 1"),

@@ -49,9 +49,7 @@ def runs(out: Path) -> dict[tuple[str, str], dict[str, Any]]:
 
 
 def bench_of(out: Path, protocol: Protocol, scenes: list[Scene], sfm: bool = False) -> quality.Quality:
-    args = argparse.Namespace(
-        out=out, validate=False, sfm=sfm, fit_cameras=False, pictures=0, known=False, finished=False
-    )
+    args = argparse.Namespace(out=out, validate=False, sfm=sfm, fit_cameras=False, pictures=0, finished=False)
     bench = quality.Quality(Study(args, "quality", protocol, scenes))
     bench.study.train(bench.measure)
     return bench
@@ -156,20 +154,19 @@ def test_finished_runs_are_not_repeated(
     assert table.path.read_text(encoding="utf-8").startswith("".join(old))
 
 
-def test_runs_of_other_sources_count_only_when_they_are_known(
+def test_runs_of_other_sources_do_not_count(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "quality.csv").write_bytes((out / "quality.csv").read_bytes())
-    monkeypatch.setattr(study, "sources", lambda: "other")
     assert call(tmp_path, *OPTIONS, "--finished") == 0
-    assert capsys.readouterr().out.count("not finished") == 6
-    monkeypatch.setattr(quality, "run_cell", lambda *rest: pytest.fail("nothing is left to train"))
-    assert call(tmp_path, *OPTIONS, "--known") == 0
     printed = capsys.readouterr().out
     assert printed.count("the runs did not keep its renders") == 2
     assert "not finished" not in printed
     longer = ("--degradations", *KINDS, "--iterations", "6")  # is another run
-    assert call(tmp_path, *longer, "--known", "--finished") == 0
+    assert call(tmp_path, *longer, "--finished") == 0
+    assert capsys.readouterr().out.count("not finished") == 6
+    monkeypatch.setattr(study, "sources", lambda: "other")
+    assert call(tmp_path, *OPTIONS, "--finished") == 0
     assert capsys.readouterr().out.count("not finished") == 6
 
 

@@ -19,7 +19,7 @@ from benchmarks.speed.inputs import RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import RasterPass, measure
 from benchmarks.speed.timing import Seconds, interleaved, median_ratio, using_threads, warmed, whole
 from benchmarks.speed.training import make_trainer, measure_memory, measure_steps, whole_step
-from hqgs.training.config import METHODS, PAPER, HQGSConfig, check_method
+from hqgs.training.config import PAPER, HQGSConfig
 from hqgs.training.trainer import Trainer
 
 DATA = read_toml(Path(__file__).with_name("speed.toml"))
@@ -50,8 +50,7 @@ class Speed:
 
     @cached_property
     def trainers(self) -> dict[str, Trainer]:
-        method = self.config["method"]
-        return {f"{method}, {n:,}": self._trainer(n, method) for n in self.config["step_gaussians"]}
+        return {f"3dgs, {n:,}": self._trainer(n, "3dgs") for n in self.config["step_gaussians"]}
 
     def _trainer(self, n: int, method: str, options: HQGSConfig | None = None) -> Trainer:
         width, height = self.size
@@ -99,20 +98,15 @@ class Speed:
         ]
 
     def memory(self) -> Rows:
-        found = measure_memory(self.config["memory"])
+        found = measure_memory(self.config["memory"] | {"method": "3dgs", "seed": self.seed})
         sizes = {name: found[name] for name in ("gaussians", "width", "height")}
         peaks = {name: found[name] for name in ("imports_mb", "scene_mb", "peak_mb")}
-        return [
-            {"case": f"{found['method']}, {found['photos']} photos, {found['steps']} steps", **sizes, **peaks}
-        ]
+        return [{"case": f"3dgs, {found['photos']} photos, {found['steps']} steps", **sizes, **peaks}]
 
 
 def run(args: argparse.Namespace) -> list[str]:
     """Measure the parts that were asked for; each is written as soon as it is done."""
-    check_method(args.method)
-    same = {"method": args.method, "seed": args.seed}
-    config = sizes_of(DATA, args) | same
-    speed, table = Speed(config | {"memory": config["memory"] | same}), Table(args.out / "speed.csv")
+    speed, table = Speed(sizes_of(DATA, args)), Table(args.out / "speed.csv")
     lines, words = [], []
     for part in args.parts:
         print(f"speed: {part}", file=sys.stderr)
@@ -135,10 +129,8 @@ def run(args: argparse.Namespace) -> list[str]:
 
 
 LISTED = f"of: {', '.join(PARTS)}"
-METHOD = f"of the training step: {', '.join(METHODS)} (%(default)s)"
 OPTIONS: dict[str, dict[str, Any]] = {
     "--parts": {"nargs": "+", "choices": PARTS, "default": list(PARTS), "metavar": "PART", "help": LISTED},
-    "--method": {"default": "3dgs", "help": METHOD},
     **TIMED,
 }
 BENCHMARK = Benchmark("time and memory of the rasterizer and of a training step", run, options=OPTIONS)
