@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from benchmarks.protocol import fewer_photos
-from benchmarks.quality.cell import fall
 from benchmarks.scenes.rooms import room
 from benchmarks.scenes.sparse import BETWEEN, BEYOND, TABLE, between_and_beyond, sparse_cameras
 from hqgs.scene.scene import Scene, View
@@ -64,8 +63,3 @@ def test_the_split_of_few_photos() -> None:
     np.testing.assert_array_equal(near.seen[names[0]] if near.seen else [], np.arange(4))
     with pytest.raises(ValueError, match="photos is 1, wanted 2 to"):
         fewer_photos(scene, 1)
-
-
-def test_a_fall_counts_moments_that_measured_as_many_views() -> None:
-    history = [{"psnr": 30.0, "views": 2}, {"psnr": 21.0, "views": 5}, {"psnr": 20.5, "views": 5}]
-    assert fall(history) == pytest.approx(0.5)
