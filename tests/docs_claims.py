@@ -41,7 +41,7 @@ TOOLS = ("pip", "pytest", "ruff", "sphinx-build", "torchrun")  # of others, whos
 
 @lru_cache(maxsize=1)
 def _hqgs_commands() -> dict[str, argparse.ArgumentParser]:
-    options = {name: importlib.import_module(one.module).OPTIONS for name, one in COMMANDS.items()}
+    options = {name: importlib.import_module(place).OPTIONS for name, (place, _) in COMMANDS.items()}
     parsers: dict[str, Any] = {
         name: tyro.extras.get_parser(Whole if name == "train" else kind, prog=name, config=MARKERS)
         for name, kind in options.items()

@@ -14,5 +14,5 @@ def forks() -> ForkServerContext:
     """Its `Process` runs a function of a test file in such a process."""
     context = multiprocessing.get_context("forkserver")
     # None of the tests' own modules: their path is not set there.
-    context.set_forkserver_preload([*(command.module for command in cli.COMMANDS.values()), *LIBRARIES])
+    context.set_forkserver_preload([*(place for place, _ in cli.COMMANDS.values()), *LIBRARIES])
     return context
