@@ -366,11 +366,11 @@ def test_where_photos_placed_one_after_the_other_find_no_place_all_are_placed_at
     """And where the matches do not bear that out, they are not."""
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *args, **kwargs: {})
     given = work_on(photos, tmp_path)
-    found = Attempt(Work(tmp_path, given, 1), FINE)
+    found = Attempt(Work(tmp_path, given, 1), PASSES[0])
     found.run()
     assert found.registered == len(photos)
     monkeypatch.setattr(all_passes, "borne_out", lambda *args: 0.7)
-    found = Attempt(Work(tmp_path, given, 1), FINE)
+    found = Attempt(Work(tmp_path, given, 1), PASSES[0])
     found.run()
     assert found.model is None
 

@@ -255,9 +255,7 @@ class Attempt:
             order = sorted(models, key=lambda k: (-models[k].num_reg_images(), -models[k].num_points3D(), k))
             self.model = models[order[0]]
             self.apart = apart([placed_names(models[k]) for k in order], LEAST_PHOTOS)
-        # Coarse features tell too few points for that: a street had 452 with them, 1,680 with fine ones.
-        rich = work.quick and work.faces == 1 and not self.one.coarse
-        if rich and self.registered < ALMOST * len(work.names):
+        if work.quick and work.faces == 1 and self.registered < ALMOST * len(work.names):
             self._at_once()
         if self.model is not None:
             work.settle(self.model)
