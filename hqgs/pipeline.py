@@ -272,12 +272,13 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
     with deferred_interrupt() as interrupted:
         if out is not None:
             save_cameras(out, trainer.prepared.given, config.background)
-        while trainer.iteration < trainer.length and not any(ranks.tell(interrupted.is_set())):
-            before = trainer.iteration
+        state = trainer.state
+        while state.iteration < state.decisions.length and not any(ranks.tell(interrupted.is_set())):
+            before = state.iteration
             step = trainer.step()
 
             def due(every: int, before: int = before) -> bool:
-                return trainer.iteration // every > before // every
+                return state.iteration // every > before // every
 
             evaluate = due(config.due.eval_every)
             if evaluate:
@@ -285,14 +286,14 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
             if progress is not None:
                 progress(
                     Progress(
-                        iteration=trainer.iteration,
-                        length=trainer.length,
-                        seconds=trainer.seconds,
-                        gaussians=len(trainer.gaussians),
+                        iteration=state.iteration,
+                        length=state.decisions.length,
+                        seconds=state.seconds,
+                        gaussians=len(state.gaussians),
                         loss=step.loss,
                         view=step.view.name,
                         render=step.render.numpy(),
-                        evaluated=trainer.history[-1] if evaluate else None,
+                        evaluated=state.history[-1] if evaluate else None,
                         diagnosis=trainer.diagnosis,
                         _step=step,
                         _trainer=trainer,

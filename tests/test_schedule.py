@@ -77,7 +77,7 @@ def test_a_coarse_beginning_has_coarser_limits() -> None:
     assert [made[k].finest for k in (0, 59, 60)] == [2 * FINEST, 2 * FINEST, FINEST]
     assert schedule_of(replace(config, iterations=9_000), [large] * 3).run.half_size_until == 1_500
     degraded = schedule_of(config, [large] * 3, as_photographed=False)
-    assert degraded.config.leave_out == ()
+    assert degraded.run.settings.leave_out == ()
     assert not any(plan.coarse or plan.finest for plan in plans(degraded))
 
 

@@ -66,17 +66,13 @@ class Schedule:
         """Of a run on so many training views."""
         return cls(run, num_views, tuple(middles(num_views, run.held_photos)))
 
-    @property
-    def config(self) -> TrainConfig:
-        return self.run.settings
-
     def start(self) -> Decisions:
         """Before the first step."""
-        return Decisions(self.config.iterations, released=0, turned=0)
+        return Decisions(self.run.settings.iterations, released=0, turned=0)
 
     def plan(self, iteration: int, decisions: Decisions) -> StepPlan:
         """What step number `iteration` (1, 2, ...) does."""
-        config, before = self.config, iteration - 1
+        config, before = self.run.settings, iteration - 1
         due, stop = config.due, self.densification_end(decisions)
         coarse, part = iteration <= self.run.half_size_until, self.part(iteration, decisions)
         finest = FINEST * (COARSE_FACTOR if coarse else 1) if "growth" in config.leave_out else None
@@ -103,7 +99,7 @@ class Schedule:
         view would come again. So they follow from the iteration, and growth from the views seen.
         """
         plans = [self.plan(iteration, decisions)]
-        while len(plans) < self.config.batch and not self._pauses(plans[-1], decisions):
+        while len(plans) < self.run.settings.batch and not self._pauses(plans[-1], decisions):
             following = self.plan(plans[-1].iteration + 1, decisions)
             if following.resets or following.view in {plan.view for plan in plans}:
                 break
@@ -113,21 +109,21 @@ class Schedule:
     def _pauses(self, plan: StepPlan, decisions: Decisions) -> bool:
         """Whether something is due, or may be decided, after this plan's view."""
         iteration, densification_end = plan.iteration, self.densification_end(decisions)
-        due = {decisions.length, densification_end, self.config.due.stop, self.run.half_size_until}
+        due = {decisions.length, densification_end, self.run.settings.due.stop, self.run.half_size_until}
         due.add(self.turn_at(decisions))
         return (
             plan.densifies
             or iteration in due
-            or ("iterations" in self.config.leave_out and iteration % CHECKS == 0)
+            or ("iterations" in self.run.settings.leave_out and iteration % CHECKS == 0)
         )
 
     def turn_at(self, decisions: Decisions) -> int:
         """The iteration after which the clock may give the run another length: some steps after growth, at
         most a third of the rest, tell what the rest costs."""
-        if self.config.turn is not None:
-            return self.config.turn[0]
+        if self.run.settings.turn is not None:
+            return self.run.settings.turn[0]
         end = self.densification_end(decisions)
-        return end + min(50, max(1, (self.config.iterations - end) // 3))
+        return end + min(50, max(1, (self.run.settings.iterations - end) // 3))
 
     def holds(self, decisions: Decisions) -> bool:
         """Whether photos are held back."""
@@ -139,11 +135,11 @@ class Schedule:
         if self.holds(decisions):
             views = [k for k in views if k not in self.held]
         epoch, index = divmod(iteration - 1, len(views))
-        return views[_order(self.config.seed, epoch, len(views))[index]]
+        return views[_order(self.run.settings.seed, epoch, len(views))[index]]
 
     def part(self, iteration: int, decisions: Decisions) -> float:
         """Of the run that is done with this step, 0..1."""
-        total = self.config.iterations
+        total = self.run.settings.iterations
         if decisions.length == total:
             return iteration / total
         changed, length = decisions.turned or decisions.released, decisions.length
@@ -152,15 +148,15 @@ class Schedule:
 
     def degree(self, iteration: int) -> int:
         """Of the harmonics that are trained: it rises with the iterations."""
-        interval = self.config.due.sh_interval
-        if "growth" in self.config.leave_out and self.config.iterations > 3_000:
-            interval = min(interval, max(1, self.config.iterations // 20))
-        return min(self.config.sh_degree, iteration // interval)
+        interval = self.run.settings.due.sh_interval
+        if "growth" in self.run.settings.leave_out and self.run.settings.iterations > 3_000:
+            interval = min(interval, max(1, self.run.settings.iterations // 20))
+        return min(self.run.settings.sh_degree, iteration // interval)
 
     def densification_end(self, decisions: Decisions) -> int:
         """The iteration from which on nothing grows; a shortened run ends growth sooner."""
-        stop = self.config.due.stop
-        if decisions.length == self.config.iterations or decisions.turned:
+        stop = self.run.settings.due.stop
+        if decisions.length == self.run.settings.iterations or decisions.turned:
             return stop
         return min(stop, math.ceil((1 + REST / 2) * decisions.released))
 

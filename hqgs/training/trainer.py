@@ -147,7 +147,7 @@ class Trainer:
     def step(self, coarse: bool | None = None) -> Step:
         """Train on the next views (`Schedule.batch`). `coarse`: at the smaller size; None: as planned."""
         started = time.perf_counter()
-        state, views, config = self.state, self.prepared.training_views, self.config
+        state, views, config = self.state, self.prepared.training_views, self.plan.settings
         plans = self.schedule.batch(state.iteration + 1, state.decisions)
         if coarse is not None:
             plans = [replace(plan, coarse=coarse) for plan in plans]
@@ -165,7 +165,7 @@ class Trainer:
             if self._sound([views.views[plan.view] for plan in plans], found):
                 found.apply()
                 # By rates that fell, a step gives less back: the same decay would make the whole scene fade.
-                if decay := self.method.rate_left * (config.opacity_decay or 0.0):
+                if decay := views.method.rate_left * (config.opacity_decay or 0.0):
                     decay_opacities(state.gaussians.opacities, 1 - (1 - decay) ** len(plans))
             changed = last.densifies and self._densify(last)
             if fault := parameter_fault(state.gaussians, changed):
@@ -175,7 +175,7 @@ class Trainer:
                 raise TrainingError(state.none_left())
             for plan, noted in zip(plans, found.measured, strict=True):
                 state.iteration = plan.iteration
-                self.method.after_step(state, views.target(plan.view, plan.coarse)[0], noted)
+                views.method.after_step(state, views.target(plan.view, plan.coarse)[0], noted)
             state.recent.append((time.perf_counter() - started) / len(plans))
             if self.schedule.holds(state.decisions):
                 state.decisions = by_held_photos(self.schedule, state, self._psnr_of_held)
@@ -308,10 +308,11 @@ class Trainer:
         """As far as the method leaves them; harmonics above the degree in use never had a gradient."""
         groups = {group["name"]: group for group in self.state.optimizer.param_groups}
         densifier = self.state.densifier
-        rates = learning_rates(self.config, densifier.extent, plan.part, densifier.reach)
+        method = self.prepared.method
+        rates = learning_rates(self.plan.settings, densifier.extent, plan.part, densifier.reach)
         for name, rate in rates.items():
-            groups[name]["lr"] = self.method.rate_left * rate
-        for name, rate in self.method.rates(plan.part).items():
+            groups[name]["lr"] = method.rate_left * rate
+        for name, rate in method.rates(plan.part).items():
             groups[name]["lr"] = rate
         groups["shN"]["used"] = (plan.degree + 1) ** 2 - 1
 
@@ -415,7 +416,7 @@ def by_held_photos(schedule: Schedule, state: TrainState, psnr: Callable[[], flo
 
     `psnr`: of those photos now, dB; NaN where their masks leave nothing. Rows of the state tell it.
     """
-    decisions, iteration, total = state.decisions, state.iteration, schedule.config.iterations
+    decisions, iteration, total = state.decisions, state.iteration, schedule.run.settings.iterations
     small = iteration <= schedule.run.half_size_until
     if iteration % CHECKS == 0 and not small and not math.isnan(now := psnr()):
         if now > state.best + BETTER:
@@ -428,7 +429,7 @@ def by_held_photos(schedule: Schedule, state: TrainState, psnr: Callable[[], flo
             left = f"iterations {length + 1} to {total}"
             row = PlanRow("length", f"{length:,} iterations", why, told, "iterations", iteration, left)
             state.rows.append(row)
-    if iteration == schedule.config.due.stop:
+    if iteration == schedule.run.settings.due.stop:
         decisions = replace(decisions, released=iteration)
     if decisions.released:
         why = "the scene needs them where no other photo looks"
@@ -446,7 +447,7 @@ def by_the_clock(
     `seconds`: that the run has taken; `step`: those of a step now. Settings with a `turn` follow that in
     place of the clock.
     """
-    config = schedule.config
+    config = schedule.run.settings
     if decisions.turned:
         return decisions
     at, most = schedule.turn_at(decisions), schedule.run.clock_most
@@ -471,8 +472,8 @@ def seconds_left(schedule: Schedule, state: TrainState, pixels: float) -> float:
     done, length, count = state.iteration, state.decisions.length, len(state.gaussians)
     small = pixels / COARSE_FACTOR**2
     coarse = max(min(schedule.run.half_size_until, length) - done, 0)
-    stop, growth = schedule.densification_end(state.decisions), schedule.config.densify
-    growing = max(stop - done, 0) if schedule.config.due.start < stop else 0
+    stop, growth = schedule.densification_end(state.decisions), schedule.run.settings.densify
+    growing = max(stop - done, 0) if schedule.run.settings.due.start < stop else 0
     # Until growth ends a scene gains about twice its Gaussians: 1.4 to 7.5 times in runs of 1,000.
     more = min(2 * (growing / max(stop, 1)) ** 2 * count, max(growth.max_gaussians - count, 0))
     work = coarse * small + (length - done - coarse) * pixels
