@@ -198,7 +198,7 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
     def sfm(scene: Scene, keep: Path) -> Scene:
         assert keep == tmp_path / "sfm"
         seen.append(scene.train[0].image)
-        report = SfmReport(5, ["lost"], 40, 3.5, 0.5, [], error, error, 0.4, 0.1, 40, None, 0.3)
+        report = SfmReport(5, ["lost"], 40, 3.5, 0.5, [], error, error, 0.4, 40)
         report = replace(report, auc={"1": 0.25, "3": 0.5, "5": 0.75})
         return replace(scene, sfm=report, points=scene.points + np.float32(0.01))
 

@@ -90,7 +90,7 @@ def test_sfm_replaces_poses_and_points_once(
 ) -> None:
     """A folder of photos alone has its poses from clean photos already; degraded ones give others."""
     error = {"median": 0.1, "max": 0.2}
-    report = SfmReport(5, ["lost.png"], 40, 3.5, 0.5, [], error, error, 0.4, 0.1, 40)
+    report = SfmReport(5, ["lost.png"], 40, 3.5, 0.5, [], error, error, 0.4, 40)
     seen: list[Any] = []
 
     def load(path: str, downscale: float, **_: Any) -> Scene:
