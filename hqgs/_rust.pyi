@@ -29,8 +29,7 @@ class Frame:
 class Composite:
     """Tile lists and replay state of a composited frame."""
 
-    work: tuple[int, int, int]
-    blended: int
+    work: tuple[int, int]
     bin_seconds: float
 
 class Separable:

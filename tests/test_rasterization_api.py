@@ -261,7 +261,7 @@ def test_a_batch_is_its_scenes_one_by_one(shape: tuple[int, ...], sh_degree: int
     meta["means2d"].retain_grad()
     weights = torch.linspace(-1, 1, images.numel(), dtype=F64).view(images.shape)
     ((images * weights).sum() + 0.3 * alphas.square().sum() + 0.01 * meta["depths"].sum()).backward()
-    works = [0, 0, 0]
+    works = [0, 0]
     for k, scene in enumerate(scenes):
         one = scene.with_grad(*(name for name in scene.tensors() if name != "Ks"))
         image, alpha, known = hqgs.rasterization(**one.arguments(), render_mode=mode)

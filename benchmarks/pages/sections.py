@@ -12,14 +12,14 @@ from benchmarks.rows import RUN, pairs_of
 
 
 def stages_table(passes: DataFrame) -> str:
-    """Forward and backward by stage, and over the limit of its arithmetic."""
+    """Forward and backward by stage."""
     lines = [line | dict(pairs_of(line["stages"])) for line in records(passes)]
     stages = [name for name, _ in pairs_of(passes.iloc[0]["stages"])]
     body = [
-        [f"{line['gaussians']:,.0f}", *(number(line[name], "ms") for name in (*stages, "seconds")),
-         f"{line['seconds'] / line['limit_seconds']:.2f}", f"{line['lane_use']:.0%}"] for line in lines
-    ]  # fmt: skip
-    return table(["Gaussians", *stages, "whole", "whole / limit", "lanes in use"], body)
+        [f"{line['gaussians']:,.0f}", *(number(line[name], "ms") for name in (*stages, "seconds"))]
+        for line in lines
+    ]
+    return table(["Gaussians", *stages, "whole"], body)
 
 
 def cases_in_ms(runs: DataFrame) -> str:

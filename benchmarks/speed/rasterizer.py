@@ -1,8 +1,4 @@
-"""Forward and backward of the rasterizer, stage by stage, against the limit of its arithmetic.
-
-The limit is a lane of an AVX-512 core that does nothing but blend, with all lanes in use and all data in
-cache (measured with a probe of the arithmetic).
-"""
+"""Forward and backward of the rasterizer, stage by stage."""
 
 from __future__ import annotations
 
@@ -18,8 +14,6 @@ from benchmarks.speed.timing import Seconds, StageClock, interleaved, warmed, wh
 
 STAGES = list(CRATE.values())
 BIN = "bin"  # what the tile lists take of "bin and composite"
-BLOCK_PIXELS = 16  # lanes of a block of 4 x 4 pixels
-LIMIT_NS = 0.65 + 1.05  # of one core, for a pair that blends: forward, backward
 
 
 class RasterPass:
@@ -34,8 +28,7 @@ class RasterPass:
         self.arguments |= {"viewmats": viewmat, "Ks": K, "width": inputs.width, "height": inputs.height}
         self.arguments |= {"backgrounds": torch.from_numpy(inputs.background[None]).to(dtype), "sh_degree": 3}
         self.v_image = torch.from_numpy(inputs.v_image[None]).to(dtype)
-        self.work = (0, 0, 0)  # of the last pass: pairs, blocks, blocks with a change
-        self.blended = 0  # (Gaussian, pixel) pairs of the last pass that was timed
+        self.work = (0, 0)  # of the last pass: pairs of Gaussian and tile, of Gaussian and block
 
     def run(self) -> torch.Tensor:
         """One pass; returns the image [1, H, W, 3], the gradients are in the leaves."""
@@ -49,9 +42,7 @@ class RasterPass:
         with clock.watching(CRATE):
             seconds = clock.seconds(self.run, STAGES)
         self.clear()
-        composites = [composite for composite, *_ in clock.kept]  # which the crate counts and times itself
-        self.blended = sum(composite.blended for composite in composites)
-        return seconds | {BIN: sum(composite.bin_seconds for composite in composites)}
+        return seconds | {BIN: sum(composite.bin_seconds for composite, *_ in clock.kept)}
 
     def clear(self) -> None:
         """Free the gradients, so that the many cases of a benchmark fit into memory together."""
@@ -59,31 +50,15 @@ class RasterPass:
             leaf.grad = None
 
 
-def count_work(case: RasterPass, pixels: int) -> dict[str, Any]:
-    """What the crate counted in the last pass: (Gaussian, pixel) pairs that changed one of so many pixels,
-    (Gaussian, tile) pairs, (Gaussian, block) pairs that each pass evaluates, those that changed a pixel."""
-    tile_pairs, blocks, changed_blocks = case.work
-    return {
-        "blended_per_pixel": case.blended / pixels,
-        "tile_pairs": tile_pairs,
-        "blocks": blocks,
-        "changed_share": changed_blocks / blocks,
-        "lane_use": case.blended / (BLOCK_PIXELS * blocks),
-        "limit_core_seconds": case.blended * LIMIT_NS * 1e-9,
-    }
-
-
 def measure(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]]:
-    """Time and work of each of the inputs; the limit is that of all threads."""
+    """Time and work of each of the inputs."""
     passes = [RasterPass(x) for x in inputs]
     measured = interleaved({k: warmed(case) for k, case in enumerate(passes)}, repeats)
     rows = []
     for x, case, rounds in zip(inputs, passes, measured.values(), strict=True):
-        work = count_work(case, x.width * x.height)
-        limit = work.pop("limit_core_seconds") / hqgs.get_num_threads()
         stages = rounds[[*STAGES, "rest"]].median().to_dict()
         compositing = (rounds["bin and composite"] - rounds[BIN] + rounds["composite backward"]).median()
         row = {"case": f"{len(x):,}", "gaussians": len(x), "width": x.width, "height": x.height}
-        row |= whole(rounds) | {"limit_seconds": limit, "compositing_seconds": compositing}
-        rows.append(row | work | {"stages": stages})
+        row |= whole(rounds) | {"compositing_seconds": compositing, "stages": stages}
+        rows.append(row | dict(zip(("tile_pairs", "blocks"), case.work, strict=True)))
     return rows

@@ -38,7 +38,7 @@ class RasterizationMeta(TypedDict):
     tile_height: int
     n_batches: int
     n_cameras: int
-    work: tuple[int, int, int]  # pairs of Gaussian and tile, blocks evaluated, blocks with a change
+    work: tuple[int, int]  # pairs of Gaussian and tile, blocks evaluated
 
 
 class Later:

@@ -189,7 +189,7 @@ def _rendered(
     for k, name in enumerate(("batch_ids", "camera_ids", "gaussian_ids")):
         meta[name] = pairs and Later(pairs.ids, k)
     meta |= {"n_batches": len(scenes), "n_cameras": len(scenes[0]["viewmats"])}
-    meta["work"] = tuple(sum(work[k] for work in works) for k in range(3))
+    meta["work"] = tuple(sum(work[k] for work in works) for k in range(2))
     return together(images), together(alphas), meta
 
 

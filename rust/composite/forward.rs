@@ -197,17 +197,16 @@ pub(super) fn forward_tile<S: Simd, T: Real, const D: usize>(
     transmittance: &mut [T],
     colors: &mut [Pixels<T>],
 ) -> Work {
-    let mut work = [list.records.len() as u64, 0, 0, 0];
+    let mut work = [list.records.len() as u64, 0];
     for (p, _, n) in input.runs(tile) {
         transmittance[p..p + n].fill(T::ONE);
     }
     for (block, depth) in depths.iter_mut().enumerate() {
         let pixels = &mut transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
         let layers = input.layers(list, block);
-        let blended = for_count!(kernel::vectors::<S, T>(), V => kernel::blend::<S, T, D, V>(simd, grid, block, layers, pixels, colors));
-        *depth = blended.layers as u32;
-        let more = [0, blended.layers as u64, blended.changed, blended.pixels];
-        work = plus(work, more);
+        let evaluated = for_count!(kernel::vectors::<S, T>(), V => kernel::blend::<S, T, D, V>(simd, grid, block, layers, pixels, colors));
+        *depth = evaluated as u32;
+        work[1] += evaluated as u64;
     }
     work
 }

@@ -80,9 +80,8 @@ pub struct Composited<T> {
     transmittance: Vec<T>,
 }
 
-/// The work of the forward pass: (Gaussian, tile) pairs, (Gaussian, block) pairs that were evaluated, those in which a
-/// pixel changed, (Gaussian, pixel) pairs that were blended.
-pub type Work = [u64; 4];
+/// The work of the forward pass: (Gaussian, tile) pairs, (Gaussian, block) pairs that were evaluated.
+pub type Work = [u64; 2];
 
 /// The sum of two.
 pub fn plus(a: Work, b: Work) -> Work {

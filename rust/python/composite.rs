@@ -23,12 +23,9 @@ pub(crate) struct Composite {
     channels: usize,
     /// Of each camera; a `Vec<View<T>>`.
     views: AnyType,
-    /// Pairs of Gaussian and tile, blocks evaluated, blocks with a change: the work of the forward pass.
+    /// Pairs of Gaussian and tile, blocks evaluated: the work of the forward pass.
     #[pyo3(get)]
-    work: (u64, u64, u64),
-    /// (Gaussian, pixel) pairs that were blended.
-    #[pyo3(get)]
-    blended: u64,
+    work: (u64, u64),
     /// Wall-clock seconds that the tile lists took.
     #[pyo3(get)]
     bin_seconds: f64,
@@ -69,7 +66,7 @@ pub(crate) fn composite_forward<'py>(
         let backgrounds = backgrounds.as_ref().map(Array::slice);
         let (views, image, alphas, work, bin_seconds) = threads::run(py, || {
             let (mut images, mut alphas, mut views) = (Vec::new(), Vec::new(), Vec::new());
-            let (mut work, mut bin_seconds) = ([0; 4], 0.0);
+            let (mut work, mut bin_seconds) = ([0; 2], 0.0);
             for (i, camera) in frame.cameras.iter().enumerate() {
                 let view = composite::forward(
                     &frame.projections[i],
@@ -88,13 +85,11 @@ pub(crate) fn composite_forward<'py>(
             let alphas = join(&mut alphas, |alphas| alphas)?;
             Ok((views, image, alphas, work, bin_seconds))
         })?;
-        let [pairs, blocks, changed, blended] = work;
         let state = Composite {
             frame: Arc::clone(frame),
             channels,
             views: Box::new(views),
-            work: (pairs, blocks, changed),
-            blended,
+            work: work.into(),
             bin_seconds,
         };
         let out = (state, image.into_pyarray(py), alphas.into_pyarray(py));

@@ -25,7 +25,7 @@ const EXP2_F64: [f64; 14] = {
     c
 };
 
-/// `2^x` of N vectors: round to the nearest integer by adding `magic` (1.5 x 2^mantissa bits), whose low bits then
+/// `2^x` of N times V vectors: round to the nearest integer by adding `magic` (1.5 x 2^mantissa bits), whose low bits then
 /// hold that integer; evaluate the polynomial at the rest; add the integer to the exponent. Step by step for all of
 /// them, so that the processor need not wait for one.
 macro_rules! exp2 {
@@ -33,9 +33,10 @@ macro_rules! exp2 {
         let splat = |x: $T| Lanes::<$T, S>::splat($simd, x);
         let magic = splat($magic);
         let last = $coefficients.len() - 1;
-        let mut shifted = [magic; N];
-        let mut p = [splat($coefficients[last]); N];
-        for (x, shifted) in $x.iter_mut().zip(&mut shifted) {
+        let mut shifted = [[magic; V]; N];
+        let mut p = [[splat($coefficients[last]); V]; N];
+        let x = $x.as_flattened_mut();
+        for (x, shifted) in x.iter_mut().zip(shifted.as_flattened_mut()) {
             *x = x.max(splat($min));
             *shifted = *x + magic;
             *x -= *shifted - magic;
@@ -43,11 +44,15 @@ macro_rules! exp2 {
         let mut k = last;
         while k > 0 {
             k -= 1;
-            for (p, f) in p.iter_mut().zip($x.iter()) {
+            for (p, f) in p.as_flattened_mut().iter_mut().zip(x.iter()) {
                 *p = p.mul_add(*f, splat($coefficients[k]));
             }
         }
-        for ((x, p), shifted) in $x.iter_mut().zip(p).zip(shifted) {
+        for ((x, p), shifted) in x
+            .iter_mut()
+            .zip(p.as_flattened())
+            .zip(shifted.as_flattened())
+        {
             *x = Lanes::<$T, S>::from_bits(p.to_bits() + (shifted.to_bits() << $bits));
         }
     }};
@@ -55,13 +60,19 @@ macro_rules! exp2 {
 
 /// [`Real::exp2`](super::Real::exp2) in f32.
 #[inline(always)]
-pub(super) fn exp2_f32<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<f32, S>; N]) {
+pub(super) fn exp2_f32<S: Simd, const N: usize, const V: usize>(
+    simd: S,
+    x: &mut [[Lanes<f32, S>; V]; N],
+) {
     exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32);
 }
 
 /// [`Real::exp2`](super::Real::exp2) in f64.
 #[inline(always)]
-pub(super) fn exp2_f64<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<f64, S>; N]) {
+pub(super) fn exp2_f64<S: Simd, const N: usize, const V: usize>(
+    simd: S,
+    x: &mut [[Lanes<f64, S>; V]; N],
+) {
     const MAGIC: f64 = 6_755_399_441_055_744.0;
     exp2!(f64, simd, x, -1022.0, MAGIC, 52u32, EXP2_F64);
 }
@@ -70,11 +81,11 @@ pub(super) fn exp2_f64<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<f64, S>;
 #[inline(always)]
 pub(crate) fn exp<S: Simd>(simd: S, x: Wide<S>) -> Wide<S> {
     const LN_MAX: f64 = 709.782_712_893_384; // of the largest number
-    let mut power = [x.min(splat(simd, LN_MAX)) * std::f64::consts::LOG2_E];
+    let mut power = [[x.min(splat(simd, LN_MAX)) * std::f64::consts::LOG2_E]];
     exp2_f64(simd, &mut power);
     let finite = x
         .simd_le(splat(simd, LN_MAX))
-        .select(power[0], splat(simd, f64::INFINITY));
+        .select(power[0][0], splat(simd, f64::INFINITY));
     x.simd_eq(x).select(finite, x)
 }
 
@@ -119,9 +130,9 @@ mod tests {
             (0..20_000)
                 .map(|i| {
                     let x = T::from_f64(-f64::from(i) * 0.0037);
-                    let mut y = [Lanes::<T, S>::splat(simd, x)];
+                    let mut y = [[Lanes::<T, S>::splat(simd, x)]];
                     T::exp2(simd, &mut y);
-                    (y[0][0].to_f64() / x.to_f64().exp2() - 1.0).abs()
+                    (y[0][0][0].to_f64() / x.to_f64().exp2() - 1.0).abs()
                 })
                 .fold(0.0, f64::max)
         }

@@ -31,7 +31,7 @@ pub trait Real: sealed::Scalar + Send + Sync + 'static {
     /// `2^x` of some vectors for `x <= 0`, lane by lane, in their place. Relative error at most 1.2e-7 (f32), 3e-16 (f64) down to the
     /// smallest normal number; below it the result is that number, which every caller cuts off.
     #[doc(hidden)]
-    fn exp2<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<Self, S>; N]);
+    fn exp2<S: Simd, const N: usize, const V: usize>(simd: S, x: &mut [[Lanes<Self, S>; V]; N]);
 }
 
 impl Real for f32 {
@@ -55,7 +55,7 @@ impl Real for f32 {
     }
 
     #[inline(always)]
-    fn exp2<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<Self, S>; N]) {
+    fn exp2<S: Simd, const N: usize, const V: usize>(simd: S, x: &mut [[Lanes<Self, S>; V]; N]) {
         exp2_f32(simd, x);
     }
 }
@@ -81,7 +81,7 @@ impl Real for f64 {
     }
 
     #[inline(always)]
-    fn exp2<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<Self, S>; N]) {
+    fn exp2<S: Simd, const N: usize, const V: usize>(simd: S, x: &mut [[Lanes<Self, S>; V]; N]) {
         exp2_f64(simd, x);
     }
 }

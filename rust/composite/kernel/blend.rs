@@ -5,18 +5,7 @@ use crate::{
     constants::BLOCK_PIXELS,
     simd::{Lanes, Real},
 };
-use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
-
-/// Counts of one block.
-#[derive(Default)]
-pub struct Blended {
-    /// Layers evaluated.
-    pub layers: usize,
-    /// Layers that changed a pixel.
-    pub changed: u64,
-    /// Pairs of a layer and a pixel that were blended.
-    pub pixels: u64,
-}
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
 
 /// The pixels of a block (V vectors) on their way through its layers.
 struct Way<S: Simd, T: Real, const D: usize, const V: usize> {
@@ -25,10 +14,6 @@ struct Way<S: Simd, T: Real, const D: usize, const V: usize> {
     open: [Lanes<T, S>; V],
     /// Colours so far.
     sums: [[Lanes<T, S>; V]; D],
-    /// How many layers each pixel blends: it is finished long before f32 cannot count them.
-    blended: [Lanes<T, S>; V],
-    /// Layers that changed a pixel.
-    changed: u64,
 }
 
 impl<S: Simd, T: Real, const D: usize, const V: usize> Way<S, T, D, V> {
@@ -43,11 +28,11 @@ impl<S: Simd, T: Real, const D: usize, const V: usize> Way<S, T, D, V> {
         colors: &mut [Pixels<T>],
         at: usize,
     ) {
-        let zero = Lanes::<T, S>::splat(simd, T::ZERO);
-        let mut changed = 0;
         for j in 0..V {
             let met = decision.meet(alpha[j], self.open[j]);
-            let weight = met.blended.select(self.open[j] * alpha[j], zero);
+            let weight = met
+                .blended
+                .select(self.open[j] * met.alpha, decision.nothing);
             for (c, color) in rgb.iter().enumerate() {
                 let color = Lanes::<T, S>::splat(simd, *color);
                 if D > 0 {
@@ -61,16 +46,12 @@ impl<S: Simd, T: Real, const D: usize, const V: usize> Way<S, T, D, V> {
             }
             self.after[j] = met.blended.select(met.behind, self.after[j]);
             self.open[j] = met.open;
-            changed |= met.blended.to_bitmask();
-            let one_more = self.blended[j] + T::ONE;
-            self.blended[j] = met.blended.select(one_more, self.blended[j]);
         }
-        self.changed += u64::from(changed != 0);
     }
 }
 
 /// Blend the layers over one block (V vectors). `transmittance` is 1 inside the image and 0 outside before,
-/// and what the last layer leaves after. The colours go to `colors[channel]`, block by block.
+/// and what the last layer leaves after. The colours go to `colors[channel]`, block by block. Returns the layers evaluated.
 #[inline(always)]
 pub fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
     simd: S,
@@ -79,7 +60,7 @@ pub fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
     layers: Layers<T>,
     transmittance: &mut [T],
     colors: &mut [Pixels<T>],
-) -> Blended {
+) -> usize {
     let channels = if D > 0 { D } else { layers.channels };
     let at = block * BLOCK_PIXELS;
     let pixels = grid.block::<S, V>(simd, block);
@@ -90,10 +71,8 @@ pub fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
         after: before,
         open: before,
         sums: [[zero; V]; D],
-        blended: [zero; V],
-        changed: 0,
     };
-    let mut counts = Blended::default();
+    let mut evaluated = 0;
     let rgb = |k: u32| &layers.colors[k as usize * channels..(k as usize + 1) * channels];
     for part in layers.list.chunks(STRIDE) {
         match <&[u32; STRIDE]>::try_from(part) {
@@ -104,6 +83,14 @@ pub fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
                 way.meet(simd, &decision, c, rgb(part[2]), colors, at);
                 way.meet(simd, &decision, d, rgb(part[3]), colors, at);
             }
+            Ok(part) if V == 2 => {
+                let [a, b] = layers.alphas(simd, &[part[0], part[1]], pixels);
+                way.meet(simd, &decision, a, rgb(part[0]), colors, at);
+                way.meet(simd, &decision, b, rgb(part[1]), colors, at);
+                let [a, b] = layers.alphas(simd, &[part[2], part[3]], pixels);
+                way.meet(simd, &decision, a, rgb(part[2]), colors, at);
+                way.meet(simd, &decision, b, rgb(part[3]), colors, at);
+            }
             _ => {
                 for &k in part {
                     let [alpha] = layers.alphas(simd, &[k], pixels);
@@ -111,14 +98,10 @@ pub fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
                 }
             }
         }
-        counts.layers += part.len();
+        evaluated += part.len();
         if decision.finished(&way.open) {
             break;
         }
-    }
-    counts.changed = way.changed;
-    for blended in way.blended {
-        counts.pixels += blended.reduce_sum().to_f64() as u64;
     }
     store::<S, T, V>(transmittance, way.after);
     for (c, color) in colors[..channels].iter_mut().enumerate() {
@@ -135,5 +118,5 @@ pub fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
         }
         store::<S, T, V>(&mut color[at..], sum);
     }
-    counts
+    evaluated
 }

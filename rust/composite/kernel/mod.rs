@@ -146,19 +146,22 @@ impl<T: Real> Layers<'_, T> {
     ) -> [[Lanes<T, S>; V]; N] {
         let cap = Lanes::<T, S>::splat(simd, T::from_f64(ALPHA_MAX));
         let records = layers.map(|k| &self.records[k as usize]);
-        let mut out = [[cap; V]; N];
-        for j in 0..V {
-            let mut powers = [cap; N];
-            for (power, record) in powers.iter_mut().zip(records) {
-                let (u, v) = RecordLanes::<S, T>::new(simd, record).position(x[j], y[j]);
-                *power = -u.mul_add(u, v * v);
-            }
-            T::exp2(simd, &mut powers);
-            for ((out, power), record) in out.iter_mut().zip(powers).zip(records) {
-                out[j] = (Lanes::<T, S>::splat(simd, record.opacity) * power).min(cap);
+        let mut powers = [[cap; V]; N];
+        for (powers, record) in powers.iter_mut().zip(records) {
+            let record = RecordLanes::<S, T>::new(simd, record);
+            for ((power, x), y) in powers.iter_mut().zip(x).zip(y) {
+                let (u, v) = record.position(x, y);
+                *power = (-u).mul_add(u, -(v * v));
             }
         }
-        out
+        T::exp2(simd, &mut powers);
+        for (powers, record) in powers.iter_mut().zip(records) {
+            let opacity = Lanes::<T, S>::splat(simd, record.opacity);
+            for power in powers {
+                *power = (opacity * *power).min(cap);
+            }
+        }
+        powers
     }
 }
 
@@ -171,12 +174,15 @@ pub(super) struct Decision<S: Simd, T: Real> {
     floor: Lanes<T, S>,
     /// Transmittance at which a pixel is finished.
     least: Lanes<T, S>,
-    one: Lanes<T, S>,
+    /// -0, which adds nothing to any number. (To choose between a number and 0 takes two steps with AVX2.)
+    nothing: Lanes<T, S>,
 }
 
 /// What becomes of pixels that meet a layer.
 pub(super) struct Met<S: Simd, T: Real> {
-    /// The pixels that blend it.
+    /// Its alpha, 0 where that is too small.
+    pub alpha: Lanes<T, S>,
+    /// The pixels that are open behind it; the others do not blend it.
     pub blended: <Lanes<T, S> as SimdBase<S>>::Mask,
     /// Transmittance behind the layer, where it is blended.
     pub behind: Lanes<T, S>,
@@ -190,7 +196,7 @@ impl<S: Simd, T: Real> Decision<S, T> {
         Self {
             floor: Lanes::<T, S>::splat(simd, layers.floor),
             least: Lanes::<T, S>::splat(simd, layers.least),
-            one: Lanes::<T, S>::splat(simd, T::ONE),
+            nothing: Lanes::<T, S>::splat(simd, -T::ZERO),
         }
     }
 
@@ -198,12 +204,13 @@ impl<S: Simd, T: Real> Decision<S, T> {
     /// they cannot disagree.
     #[inline(always)]
     pub fn meet(&self, alpha: Lanes<T, S>, open: Lanes<T, S>) -> Met<S, T> {
-        // From layer to layer a product and a maximum depend on each other, and no more. No factor is above 1, so that
+        // From layer to layer a product and a maximum depend on each other, and no more. No alpha is below 0, so that
         // what was `least` or below stays there, and the pixel finished.
-        let opaque = alpha.simd_ge(self.floor);
-        let behind = open * opaque.select(self.one - alpha, self.one);
+        let alpha = alpha.simd_ge(self.floor).select(alpha, self.nothing);
+        let behind = alpha.mul_add(-open, open);
         Met {
-            blended: opaque & behind.simd_gt(self.least),
+            alpha,
+            blended: behind.simd_gt(self.least),
             behind,
             open: behind.max(self.least),
         }

@@ -106,6 +106,14 @@ pub fn replay<S: Simd, T: Real, const V: usize>(
                 keep(simd, &decision, alphas[2], &mut open, c);
                 keep(simd, &decision, alphas[3], &mut open, d);
             }
+            (Ok(part), [a, b, c, d]) if V == 2 => {
+                let alphas = layers.alphas(simd, &[part[0], part[1]], pixels);
+                keep(simd, &decision, alphas[0], &mut open, a);
+                keep(simd, &decision, alphas[1], &mut open, b);
+                let alphas = layers.alphas(simd, &[part[2], part[3]], pixels);
+                keep(simd, &decision, alphas[0], &mut open, c);
+                keep(simd, &decision, alphas[1], &mut open, d);
+            }
             (_, out) => {
                 for (&k, out) in part.iter().zip(out) {
                     let [alpha] = layers.alphas(simd, &[k], pixels);
@@ -130,7 +138,7 @@ fn keep<S: Simd, T: Real, const V: usize>(
     store::<S, T, V>(&mut front.0, *open);
     for j in 0..V {
         let met = decision.meet(alpha[j], open[j]);
-        alphas[j] = met.blended.select(alpha[j], zero);
+        alphas[j] = met.blended.select(met.alpha, decision.nothing);
         open[j] = met.open;
     }
     store::<S, T, V>(&mut layer.0, alphas);
