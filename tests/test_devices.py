@@ -20,11 +20,14 @@ from hqgs.cli.main import main
 from hqgs.diagnosis.colors import (
     LEAST,
     Devices,
+    DeviceSigns,
     SharedColors,
+    Sign,
     device_findings,
     device_signs,
     grouped,
     log_gains,
+    plain_devices,
 )
 from hqgs.evaluation.held_out import HeldOutViews, look_of, looks_of_devices, measured
 from hqgs.evaluation.metrics import psnr
@@ -328,3 +331,14 @@ def test_a_new_view_in_the_look_of_a_photo(tmp_path: Path, capsys: pytest.Captur
     assert look_of(out, "view1").response.any()  # alone
     (out / "report.json").unlink()
     assert main(["render", str(out), "--out", str(tmp_path / "x"), "--look", "view1"]) == 2
+
+
+@pytest.mark.parametrize(("size", "error", "found", "certain"), [
+    (0.3, 0.03, True, True), (0.5, 0.1, True, False), (0.3, 0.08, False, False), (9.0, 0.1, False, False),
+])  # fmt: skip
+def test_a_lens_that_is_not_told_surely_is_tried(
+    size: float, error: float, found: bool, certain: bool
+) -> None:
+    sign = Sign("vignetting", size, error)
+    finding, _ = device_findings(DeviceSigns(plain_devices([]), sign, None))
+    assert (finding.needed, finding.certain) == (found, certain)

@@ -45,6 +45,9 @@ MOST: dict[str, float] = {
     "response": STEEPEST / 4,
 }  # beyond, no lens and no sensor does so
 SURE = 3
+# Standard errors from which a short run, which differs by more than vignetting gains, is not asked. What was
+# put on three captures, 0.3 and above, is told by 7 to 50; what a street's changing light feigns by 4 to 5.
+CERTAIN = 6
 DEVICE_PHOTOS, DEVICES_MOST = 4, 16  # that a camera must have taken; cameras that are told apart
 ROWS = 12_000  # colours of points in photos that are looked at
 # Rounds: of means over photos and points in turn; of weights; of lenses and responses.
@@ -208,6 +211,10 @@ class Sign(NamedTuple):
     @property
     def needed(self) -> bool:
         return self.size >= self.least and self.possible
+
+    @property
+    def certain(self) -> bool:
+        return self.needed and self.size >= CERTAIN * self.error
 
 
 @dataclass(frozen=True)
@@ -440,7 +447,7 @@ def device_findings(signs: DeviceSigns | None) -> tuple[Finding, Finding]:
 
 def _device_finding(sign: Sign, reason: str, least: str) -> Finding:
     if sign.needed:
-        return Finding(sign.kind, reason, sign.kind, sign.size)
+        return Finding(sign.kind, reason, sign.kind, sign.size, certain=sign.certain)
     if not sign.possible:
         return Finding(sign.kind, f"{reason}, which no camera does: the light changed (flash, reflections)")
     return Finding(sign.kind, f"{reason} (needed from {least})", None, sign.size)

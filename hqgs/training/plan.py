@@ -13,7 +13,6 @@ from hqgs.base.left_out import CORRECTION, LeftOut
 from hqgs.base.text import aligned
 from hqgs.evaluation.constants import SCATTER
 from hqgs.evaluation.records import PlanRowRecord
-from hqgs.photos.formula import DEVICES
 from hqgs.training.config import TrainConfig
 
 
@@ -39,13 +38,10 @@ class Tried:
         """Whether the gain is more than photos scatter."""
         return self.gain > SCATTER and self.sure > 1
 
-    def keeps(self, kind: str) -> bool:
-        """Whether a look of this kind is learned: photos gain more than they differ.
-
-        What a camera does has been told from many colours; short runs differ by more than it gains, so they
-        only tell where it harms.
-        """
-        return self.sure > (-1 if kind in DEVICES else 1)
+    @property
+    def keeps(self) -> bool:
+        """Whether a look is learned: photos gain more than they differ."""
+        return self.sure > 1
 
     def __str__(self) -> str:
         return f"{self.gain:+.2f} ± {self.error:.2f} dB on {self.photos} validation photos of short test runs"

@@ -40,13 +40,13 @@ class Looks(NamedTuple):
     photos: int  # at most
     side: int  # px of the copies
     steps: int  # of each short run
-    each: int  # photo is half held back
 
 
 # A photo's own shake is learned after 20 looks at it, and seen where it has a pixel: in copies of 120 px that
 # of the built-in room gains nothing, in 240 px 0.8 dB. Photos gain so differently that it takes many to tell.
 # Focus takes more looks than a short run has: there the diagnosis decides.
-LOOKS = (Looks(("exposure", "vignetting", "response"), 1000, 120, 200, 4), Looks(("shake",), 16, 240, 320, 2))
+LOOKS = (Looks(("exposure", "vignetting", "response"), 1000, 120, 200), Looks(("shake",), 16, 240, 320))
+HALVES = 2  # of how many photos one is half held back: few photos leave few to tell by
 EACH, OFFSETS = 4, (1, 3)  # every so-manieth photo is held back, from these on, one after the other
 STEPS, SIDES = 400, (80, 320)  # of each short run; px of the copies, at least and at most
 SHARE = 0.05  # of the pixels that the run trains on: those of the trial of growth
@@ -112,17 +112,18 @@ def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = 
 
 
 def tried_looks(
-    scene: Scene, settings: TrainConfig, begin: Begin, on_stage: OnStage = silent
+    scene: Scene, settings: TrainConfig, certain: Sequence[str], begin: Begin, on_stage: OnStage = silent
 ) -> dict[str, Tried]:
-    """What photos held back gain by each of the LOOKS of a formation, beside those before it that pay."""
-    found, kept = dict[str, Tried](), list[str]()
+    """What photos held back gain by each of the LOOKS of a formation, beside those before it that pay and
+    those that are `certain`."""
+    found, kept = dict[str, Tried](), [kind for kind in certain if kind in _kinds(settings)]
     for group in LOOKS:
-        asked = [kind for kind in group.kinds if kind in _kinds(settings)]
+        asked = [kind for kind in group.kinds if kind in _kinds(settings) and kind not in certain]
         if not asked or len(scene.train) <= EACH or not len(scene.points):
             continue
         views = [shrunk(scene.train[k], group.side) for k in evenly(len(scene.train), group.photos)]
         views.sort(key=lambda view: view.device)  # some of each camera's are held back
-        held = {k: views[k] for k in range(OFFSETS[0], len(views), group.each)}
+        held = {k: views[k] for k in range(OFFSETS[0], len(views), HALVES)}
         halves = [_half_shown(view) if k in held else view for k, view in enumerate(views)]
         config = _settings(settings, len(views), NONE, group.steps)
         run = begin(replace(scene, train=halves, test=[]), config)
@@ -132,13 +133,14 @@ def tried_looks(
             others = _with_looks(run, [*kept, kind], held, told)
             if (tried := _of_gains(others - best)) is not None:
                 found[kind] = tried
-                best, kept = (others, [*kept, kind]) if tried.keeps(kind) else (best, kept)
+                best, kept = (others, [*kept, kind]) if tried.keeps else (best, kept)
     return found
 
 
 def _with_looks(run: ShortRun, kinds: Sequence[str], held: Mapping[int, View], told: _Told) -> Values:
     """PSNR of the hidden halves, [V, 1], of a run that learns these kinds, as their own cameras took them."""
-    hqgs = replace(run.plan.settings.hqgs, formation="+".join(kinds) or NONE)
+    learned = [kind for group in LOOKS for kind in group.kinds if kind in kinds]
+    hqgs = replace(run.plan.settings.hqgs, formation="+".join(learned) or NONE)
     run.begin(replace(run.plan, settings=replace(run.plan.settings, hqgs=hqgs)))
     told.steps(run)
     return np.array([[_of_hidden(run.taken(k), view)] for k, view in held.items()], np.float64)
