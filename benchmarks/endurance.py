@@ -70,7 +70,7 @@ def run_case(scene: Scene, config: TrainConfig) -> tuple[Run, list[dict[str, Any
     result = {"records": records, "failure": failure}
     run = {name: last.get(name) for name in ("loss", "psnr", "peak_mb")} | done.record()
     run["most_gaussians"] = max((entry["gaussians"] for entry in records), default=None)
-    run |= {"events": trainer.guard.num_events, "failure": failure} | verdict(result, config)
+    run |= {"events": trainer.state.guard.num_events, "failure": failure} | verdict(result, config)
     return run, records
 
 

@@ -315,7 +315,7 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
 
     Of several ranks the first one measures, and tells the others.
     """
-    scene, guard, ranks = trainer.prepared.given, trainer.guard, trainer.ranks
+    scene, guard, ranks = trainer.prepared.given, trainer.state.guard, trainer.ranks
     config, decisions = trainer.config, trainer.state.decisions
     if decisions.turned:
         config = replace(config, turn=(decisions.turned, decisions.length))
@@ -369,7 +369,7 @@ def _report(
         "peak_rss_mb": peak_rss_mb(),
         "history": trainer.history,
         "left_out": [item.known() for item in left_out],
-        "guard": trainer.guard.summary(),
+        "guard": trainer.state.guard.summary(),
         "world": cast(WorldRecord, {"metres": None} | replace(scene.world, place=None).json()),
         "place": place and asdict(place),
         "sfm": sfm and asdict(sfm),

@@ -352,7 +352,7 @@ def test_held_out_views_get_better() -> None:
     trainer.evaluate()
     first, last = trainer.history
     assert (last["psnr"] or 0) > (first["psnr"] or np.inf) + 5
-    assert trainer.guard.skipped == 0
+    assert trainer.state.guard.skipped == 0
 
 
 def test_the_features_are_trained_at_their_own_rate() -> None:

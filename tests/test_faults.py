@@ -426,7 +426,7 @@ def test_a_photo_that_goes_while_it_is_trained_on_is_not_missed(folder: Path, tm
         trainer.step()
     trainer.evaluate()
     trainer.save(tmp_path / CHECKPOINT)
-    assert trainer.guard.num_events == 0
+    assert trainer.state.guard.num_events == 0
 
 
 def test_a_clock_that_goes_backwards_gives_no_negative_time(

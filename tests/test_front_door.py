@@ -40,7 +40,7 @@ def test_of_copies_one_is_used_and_the_others_are_named(tmp_path: Path) -> None:
     assert photos.names == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg", "close.png", "closer.png"]
     assert len(photos.sizes) == len(photos.exif) == 5
     assert photos.notes == [
-        "5 photos, 3 of them by 1 cameras in EXIF, 2 duplicates not used",
+        "5 photos, cameras in EXIF: 1 (of 3 photos), 2 duplicates not used",
         "2 of 7 photos are duplicates and are not used: IMG_1 (1).jpg (of IMG_1.jpg), "
         "WhatsApp.jpg (of IMG_2.jpg)",
     ]

@@ -94,7 +94,7 @@ def test_gaussians_with_a_bad_gradient_are_named_and_culled(
     for name, tensor_before in before.items():  # the step changed nothing else: Adam has not seen it
         assert torch.equal(trainer.gaussians.named()[name], tensor_before[rest]), name
     assert torch.equal(trainer.state.optimizer.state[trainer.gaussians.means]["exp_avg"], moments[rest])
-    assert trainer.guard.events == [
+    assert trainer.state.guard.events == [
         {
             "iteration": 4,
             "view": step.view.name,
@@ -104,10 +104,10 @@ def test_gaussians_with_a_bad_gradient_are_named_and_culled(
             "gaussians": [3, 17],
         }
     ]
-    assert (trainer.guard.skipped, trainer.guard.culled) == (1, 2)
+    assert (trainer.state.guard.skipped, trainer.guard.culled) == (1, 2)
     for _ in range(20):
         trainer.step()
-    assert (trainer.guard.skipped, trainer.guard.culled, trainer.guard.num_events) == (1, 2, 1)
+    assert (trainer.state.guard.skipped, trainer.guard.culled, trainer.guard.num_events) == (1, 2, 1)
     assert all(bool(torch.isfinite(t).all()) for t in values(trainer).values())
 
 
@@ -134,11 +134,11 @@ def test_a_bad_parameter_is_culled_and_the_others_train_as_if_it_had_not_been(
     expected.state.densifier.grad_sum, expected.state.densifier.count = torch.zeros(39), torch.zeros(39)
     step = trainer.step()
     expected.step()
-    assert [(e["what"], e["tensors"], e["gaussians"]) for e in trainer.guard.events] == [
+    assert [(e["what"], e["tensors"], e["gaussians"]) for e in trainer.state.guard.events] == [
         ("parameter", [tensor], [11])
     ]
-    assert trainer.guard.events[0]["view"] == step.view.name
-    assert trainer.guard.skipped == 0
+    assert trainer.state.guard.events[0]["view"] == step.view.name
+    assert trainer.state.guard.skipped == 0
     for _ in range(4):
         trainer.step()
         expected.step()
@@ -155,10 +155,10 @@ def test_children_that_would_lie_nowhere_are_culled() -> None:
         trainer.state.densifier.grad_sum[4] = 1e6
     trainer.step()  # the round at 8
     assert all(bool(torch.isfinite(t).all()) for t in values(trainer).values())
-    (event,) = trainer.guard.events
+    (event,) = trainer.state.guard.events
     assert (event["what"], event["iteration"]) == ("parameter", 8)
     assert set(event["tensors"]) == {"means", "shN"}
-    assert trainer.guard.culled == event["count"] >= 3
+    assert trainer.state.guard.culled == event["count"] >= 3
     assert len(trainer.gaussians) == len(trainer.state.densifier.count) > 0
     trainer.step()
 
@@ -169,7 +169,7 @@ def test_a_gaussian_of_infinite_size_is_culled() -> None:
     with torch.no_grad():
         trainer.gaussians.scales[4, 1] = 89.0
     trainer.step()
-    (event,) = trainer.guard.events
+    (event,) = trainer.state.guard.events
     assert (event["what"], event["tensors"], event["gaussians"]) == ("parameter", ["scales"], [4])
 
 
@@ -194,16 +194,16 @@ def test_an_unexplained_loss_names_the_view(faulty: Faulty, monkeypatch: pytest.
     monkeypatch.setattr(Faulty, "loss", lambda self, r, v: real(self, r, v) * torch.nan)
     trainer = Trainer(tiny_scene(), tiny_config(method="faulty"))
     step = trainer.step()
-    (event,) = trainer.guard.events
+    (event,) = trainer.state.guard.events
     assert (event["what"], event["view"], event["count"]) == ("loss", step.view.name, 0)
 
 
 def test_a_method_s_own_gradient_is_named_and_costs_no_gaussian(faulty: Faulty) -> None:
     faulty.tensor = "offset"
     trainer = run_until(Trainer(tiny_scene(), tiny_config(method="faulty", densify=ONLY_TRAIN)), 6)
-    (event,) = trainer.guard.events
+    (event,) = trainer.state.guard.events
     assert (event["what"], event["tensors"], event["count"]) == ("gradient", ["offset"], 0)
-    assert (trainer.guard.skipped, trainer.guard.culled, len(trainer.gaussians)) == (1, 0, 40)
+    assert (trainer.state.guard.skipped, trainer.guard.culled, len(trainer.gaussians)) == (1, 0, 40)
 
 
 def test_many_events_are_counted_and_the_first_kept(faulty: Faulty) -> None:
@@ -214,11 +214,11 @@ def test_many_events_are_counted_and_the_first_kept(faulty: Faulty) -> None:
         trainer.step()
         faulty.at = 0
         trainer.step()
-        assert trainer.guard.culled == 15 * (k + 1)
-    assert trainer.guard.num_events == EVENTS_KEPT + 5
-    assert [e["iteration"] for e in trainer.guard.events] == list(range(1, 2 * EVENTS_KEPT, 2))
+        assert trainer.state.guard.culled == 15 * (k + 1)
+    assert trainer.state.guard.num_events == EVENTS_KEPT + 5
+    assert [e["iteration"] for e in trainer.state.guard.events] == list(range(1, 2 * EVENTS_KEPT, 2))
     assert all(
-        e["gaussians"] == list(range(GAUSSIANS_LISTED)) and e["count"] == 15 for e in trainer.guard.events
+        e["gaussians"] == list(range(GAUSSIANS_LISTED)) and e["count"] == 15 for e in trainer.state.guard.events
     )
 
 
@@ -228,7 +228,7 @@ def test_what_the_guard_knows_outlives_a_checkpoint(faulty: Faulty, tmp_path: Pa
     trainer.save(tmp_path / CHECKPOINT)
     again = Trainer(tiny_scene(), tiny_config(method="faulty"))
     again.restore(tmp_path / CHECKPOINT)
-    assert again.guard == trainer.guard
+    assert again.guard == trainer.state.guard
     assert again.guard.culled == 1
     assert len(again.gaussians) == 39
 

@@ -315,7 +315,7 @@ def test_other_steps_come_after_the_camera(formation: str) -> None:
     scene = tiny_scene()
     degraded = hqgs.degrade(scene, formation.replace("focus", "defocus:1"))
     trainer = run(degraded, formation, iterations=20)
-    assert trainer.guard.skipped == 0
+    assert trainer.state.guard.skipped == 0
     assert trainer.config.hqgs.formation == formation
     assert len(trainer.method.learned()) == len(scene.train)
 

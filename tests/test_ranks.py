@@ -296,14 +296,14 @@ def test_bad_photos_and_gradients_leave_their_view_out(monkeypatch: pytest.Monke
     monkeypatch.setattr(trainer.method, "loss", spoiled)
     before = trainer.gaussians.means.detach().clone()
     trainer.step()
-    assert (trainer.guard.skipped, trainer.guard.skipped_in_a_row) == (1, 0)
-    assert trainer.guard.events[0]["what"] == "loss"
+    assert (trainer.state.guard.skipped, trainer.state.guard.skipped_in_a_row) == (1, 0)
+    assert trainer.state.guard.events[0]["what"] == "loss"
     assert not torch.equal(trainer.gaussians.means.detach(), before)
     spoil_next(trainer, 3)
     before = trainer.gaussians.sh0.detach().clone()
     trainer.step()
     assert torch.equal(trainer.gaussians.sh0.detach(), torch.cat([before[:3], before[4:]]))
-    assert (trainer.guard.skipped, trainer.guard.culled) == (1 + 4, 1)
+    assert (trainer.state.guard.skipped, trainer.state.guard.culled) == (1 + 4, 1)
 
 
 def test_a_bad_gaussian_ends_no_run_of_large_steps() -> None:
@@ -311,7 +311,7 @@ def test_a_bad_gaussian_ends_no_run_of_large_steps() -> None:
     trainer = Trainer(tiny_scene(batch + 2), replace(config_of("3dgs", batch), densify=STILL))
     spoil_next(trainer, 3)
     trainer.step()
-    assert (trainer.guard.skipped, trainer.guard.skipped_in_a_row) == (batch, 1)
+    assert (trainer.state.guard.skipped, trainer.state.guard.skipped_in_a_row) == (batch, 1)
 
 
 def test_a_batch_below_one_is_refused() -> None:

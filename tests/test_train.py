@@ -178,10 +178,10 @@ def test_a_step_that_is_not_finite_is_skipped_and_counted(
     before = bits(trainer)
     trainer.step()
     assert bits(trainer) == before
-    assert trainer.guard.skipped == 1
+    assert trainer.state.guard.skipped == 1
     trainer.step()
     assert bits(trainer) != before
-    assert trainer.guard.skipped == 1
+    assert trainer.state.guard.skipped == 1
     assert all(bool(torch.isfinite(t).all()) for t in trainer.gaussians.named().values())
 
 
@@ -232,7 +232,7 @@ def test_a_view_that_sees_nothing_is_no_error() -> None:
     assert not step.render.any()
     assert bits(trainer) == before
     assert trainer.state.densifier.count.sum() == 0
-    assert trainer.guard.skipped == 0
+    assert trainer.state.guard.skipped == 0
 
 
 def test_a_method_trains_and_keeps_tensors_of_its_own(probe: Probe, tmp_path: Path) -> None:

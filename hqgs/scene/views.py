@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import groupby
 from threading import Lock
 
@@ -275,13 +275,14 @@ def to_pinhole(
 
     rows, columns = max(1, round(h / coarser)), max(1, round(w / coarser))
     ys, xs = (np.arange(rows) + 0.5) * (h / rows), (np.arange(columns) + 0.5) * (w / columns)
-    guessed = _interpolated(camera, K, xs, ys, face) if coarser > 1 else None
+    shares = partial(_shares, camera, K, face)
+    guessed = _interpolated(shares, xs, ys) if coarser > 1 else None
     grid = np.empty((rows, columns, 2), np.float32)
     inside = np.empty((rows, columns), np.bool_)
     step = max(1, AT_ONCE // columns)
     for top in range(0, rows, step):
         band = slice(top, top + step)
-        at = _shares(camera, K, xs, ys[band], face) if guessed is None else guessed[band]
+        at = shares(xs, ys[band]) if guessed is None else guessed[band]
         inside[band] = ((at >= 0) & (at <= 1)).all(-1)
         grid[band] = 2 * np.nan_to_num(at, nan=0.5, posinf=2, neginf=-1).clip(-1, 2) - 1
     if not inside.any():
@@ -294,9 +295,9 @@ def to_pinhole(
 def _shares(
     camera: pycolmap.Camera,
     K: NDArray[np.float64],
+    face: Face | None,
     xs: NDArray[np.floating],
     ys: NDArray[np.floating],
-    face: Face | None,
 ) -> NDArray[np.float64]:
     """Where the pixels of the pinhole camera `K` at columns `xs` and rows `ys` lie in the stored photo,
     [rows, columns, 2], as shares of its size, so that the declared size drops out."""
@@ -309,17 +310,13 @@ def _shares(
 
 
 def _interpolated(
-    camera: pycolmap.Camera,
-    K: NDArray[np.float64],
-    xs: NDArray[np.floating],
-    ys: NDArray[np.floating],
-    face: Face | None,
+    shares: Callable[..., NDArray[np.float64]], xs: NDArray[np.floating], ys: NDArray[np.floating]
 ) -> NDArray[np.float32] | None:
-    """The same from every LATTICE-th column and row, bilinear between them; None where that is not exact to
+    """`shares` from every LATTICE-th column and row, bilinear between them; None where that is not exact to
     EXACT px of the grid in the middle of each cell."""
     x, y = (np.linspace(side[0], side[-1], math.ceil(len(side) / LATTICE) + 1) for side in (xs, ys))
-    known = _shares(camera, K, x, y, face)
-    true = _shares(camera, K, x[:-1] + np.diff(x) / 2, y[:-1] + np.diff(y) / 2, face)
+    known = shares(x, y)
+    true = shares(x[:-1] + np.diff(x) / 2, y[:-1] + np.diff(y) / 2)
     middle = (known[1:, 1:] + known[1:, :-1] + known[:-1, 1:] + known[:-1, :-1]) / 4
     if not (np.abs(middle - true) * (len(xs), len(ys)) < EXACT).all():
         return None

@@ -33,7 +33,7 @@ from hqgs.training.config import TrainConfig, TrainingError, config_values
 from hqgs.training.densify import Densifier
 from hqgs.training.forward import Gradients, Step, gradients_of_one
 from hqgs.training.frame import Trainable
-from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, Guard, parameter_fault
+from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, parameter_fault
 from hqgs.training.methods.base import Method
 from hqgs.training.overfitting import decay_opacities
 from hqgs.training.plan import PlanRow, RunPlan, StepSeconds, Tried, left_out_of
@@ -123,10 +123,6 @@ class Trainer:
     def seconds(self) -> float:
         """Spent in steps."""
         return self.state.seconds
-
-    @property
-    def guard(self) -> Guard:
-        return self.state.guard
 
     @property
     def history(self) -> list[HistoryEntry]:

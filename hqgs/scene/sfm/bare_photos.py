@@ -282,9 +282,8 @@ def _understood(exif: list[Exif], copies: int, around: bool) -> str:
     cameras = [tags.camera[:2] for tags in exif if any(tags.camera[:2])]
     located = sum(tags.gps is not None for tags in exif)
     parts = [f"{len(exif)} {'panoramas of 360 x 180 degrees' if around else 'photos'}"]
-    parts += [
-        f"{len(cameras)} of them by {len(set(cameras))} cameras in EXIF" if cameras else "no camera in EXIF"
-    ]
+    of = f"cameras in EXIF: {len(set(cameras))} (of {len(cameras)} photos)"
+    parts += [of if cameras else "no camera in EXIF"]
     parts += [f"{copies} duplicates not used"] if copies else []
     parts += [f"GPS in {located}"] if located else []
     return ", ".join(parts)

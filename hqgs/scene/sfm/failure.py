@@ -13,8 +13,6 @@ from hqgs.scene.sfm.refine.agree import JOINT, confirmed
 
 MATCHES = pycolmap.TwoViewGeometryOptions().min_num_inliers  # that agree, of a pair; COLMAP's own
 FEW_FEATURES = 150  # a photo with fewer is blurred, or shows nothing that can be found again
-POOR = 0.25  # of the features of the others: the same
-ENOUGH_INLIERS = 30  # a pair with so many matches that one geometry bears out shows the same thing
 BORNE_OUT = 0.85  # of matches between panoramas: 0.91 and 0.93 at right places, 0.68 and 0.79 at wrong ones
 
 
@@ -61,7 +59,7 @@ def why_lost(name: str, one: Outcome) -> str:
     """Why a pass found no place for a photo, in words with numbers."""
     features, usual = one.features[name], _usual(one.features)
     matches, inliers, with_placed = one.best[name]
-    if features < max(FEW_FEATURES, POOR * usual):
+    if features < max(FEW_FEATURES, usual / 4):
         return f"blurred, dark or without texture: {features:,} features (median of all photos: {usual:,.0f})"
     if matches < MATCHES:
         return "it matches no other photo"
@@ -137,4 +135,4 @@ def _usual(features: Mapping[str, int]) -> float:
 
 
 def _pairs(one: Outcome) -> int:
-    return sum(count >= ENOUGH_INLIERS for count in one.inliers)
+    return sum(count >= 30 for count in one.inliers)  # of so many matches: they show the same thing

@@ -17,7 +17,6 @@ from hqgs.scene.faces import Face, around, faces_of
 from hqgs.scene.sfm.database import LEAST_PHOTOS, PROBED, seen_size
 from hqgs.scene.views import to_pinhole
 
-SEAM = 2.0  # times what neighbouring columns differ by: the last and the first of it are neighbours
 POLE = 0.35  # of the picture's contrast: its first and last rows show a point each
 PLAIN = 0.25  # the same: a border with less shows nothing
 FINER = 4 / math.pi  # times a face's pixels: in its middle as fine as the photo, so that SIFT sees all of it
@@ -68,7 +67,7 @@ def _closes(path: Path) -> bool:
     apart = np.abs(np.diff(pixels, axis=1)).mean((0, 2))
     seam = np.abs(pixels[:, 0] - pixels[:, -1]).mean()
     poles, border = pixels[[0, -1]].std(1).mean(1), pixels[:, 0].std(0).mean()
-    joined, poles_plain = seam <= SEAM * np.median(apart), (poles <= POLE * contrast).all()
+    joined, poles_plain = seam <= 2 * np.median(apart), (poles <= POLE * contrast).all()
     return bool(joined and poles_plain and border > PLAIN * contrast)
 
 

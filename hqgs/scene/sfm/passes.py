@@ -40,11 +40,7 @@ ALMOST = 0.95  # of the photos: with fewer, they are looked at again, more close
 COARSE, FINE = 2048, 4096
 BORNE_OUT = 0.78  # of the matches, by places found at once: 0.81 to 1 where right, 0.72 and 0.74 where wrong
 TRIED, GAIN = 6, 1.2  # photos by which a closer look is tried first; times the matches that it must bring
-TRIALS = 1000  # of RANSAC for each pair's geometry; COLMAP's 30,000 took 20 minutes of a corridor and told
-# the same pairs but for one in 23 that had 18 matches
-SELDOM = 1.3  # times the photos or points: until then, no adjustment of all that was found coarsely
 GATE = 12, 0.1  # matches with points that agree on a place, and their share of all; least
-FALSE = 2.5  # medians of the points' errors; what lies farther off is taken for a false match at last
 
 
 @dataclass(frozen=True)
@@ -163,7 +159,9 @@ class Work:
         """Look for the geometry of each pair that matches."""
         geometry, verifier = pycolmap.TwoViewGeometryOptions(), pycolmap.GeometricVerifierOptions()
         geometry.ransac.random_seed = 0
-        geometry.ransac.max_num_trials, geometry.ransac.dyn_num_trials_multiplier = TRIALS, 1.0
+        # COLMAP's 30,000 took 20 minutes of a corridor, and told the same pairs but for one in 23 that had 18
+        # matches.
+        geometry.ransac.max_num_trials, geometry.ransac.dyn_num_trials_multiplier = 1000, 1.0
         verifier.num_threads = self.threads
         verifier.rig_verification = self.faces > 1  # one geometry for all faces of two photos: floors repeat
         pycolmap.geometric_verification(database, verifier, two_view_geometry_options=geometry)
@@ -173,7 +171,9 @@ class Work:
         options.min_model_size = LEAST_PHOTOS
         mapper = options.mapper
         if self.quick:
-            options.ba_global_frames_ratio = options.ba_global_points_ratio = SELDOM
+            options.ba_global_frames_ratio = options.ba_global_points_ratio = (
+                1.3  # of what was found coarsely
+            )
             options.ba_global_max_refinements = 2
         options.ba_refine_sensor_from_rig = False
         if self.fixed:
@@ -199,7 +199,7 @@ class Work:
         """
         mapping = self.mapping()
         for _ in range(3):
-            far = FALSE * float(np.median([point.error for point in model.points3D.values()]))
+            far = 2.5 * float(np.median([point.error for point in model.points3D.values()]))
             seen = pycolmap.ObservationManager(model)
             seen.filter_all_points3D(far, mapping.mapper.filter_min_tri_angle)
             pycolmap.bundle_adjustment(model, mapping.get_global_bundle_adjustment())

@@ -25,8 +25,6 @@ from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
 from hqgs.scene.sfm.database import LARGEST
 from hqgs.scene.sfm.run import run_colmap
 
-LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on none
-
 
 @dataclass(frozen=True)
 class Search:
@@ -150,6 +148,6 @@ def _upright(viewmats: NDArray[np.float64], exif: list[Exif]) -> NDArray[np.floa
     """The rotation [3, 3] that takes the cameras' mean up to UP; the unit where they agree on none."""
     mean = np.einsum("nji,nj->ni", viewmats[:, :3, :3], ups(exif)).mean(0)
     length = float(np.linalg.norm(mean))
-    if length < LEAST_AGREED:
+    if length < 0.3:  # they agree on none
         return np.eye(3)
     return Rotation.align_vectors(np.array([UP]), (mean / length)[None])[0].as_matrix()

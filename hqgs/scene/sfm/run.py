@@ -31,7 +31,6 @@ from hqgs.scene.sfm.database import LEAST_PHOTOS
 from hqgs.scene.sfm.failure import Outcome, counts, doubtful, what_to_take, why_doubtful, why_few, why_lost
 
 LEAST_SHARE = 0.5  # of the photos must find their place in a model
-MANY = 150  # photos: from where on the user is told before it begins
 
 _BLOCK = re.compile(r"Processing block \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
 PROGRAM = Path(__file__).with_name("program.py")
@@ -148,7 +147,7 @@ def run_colmap(
     kept = None if keep is None else keep / key_of(str(sorted(given)), _pieces(names, contents, given))
     if kept is not None and kept.is_dir():
         return _read(kept, called or {})
-    if len(names) > MANY:
+    if len(names) > 150:
         note = f"{len(names)} photos take COLMAP long; 100 are enough for most scenes"
         on_stage(Stage("COLMAP", 0, len(names), note))
     with _workplace(kept) as directory:

@@ -21,12 +21,8 @@ from hqgs.scene.sfm.refine.patches import PATCH_SIDE, PatchView, aligned, read_p
 from hqgs.scene.sfm.refine.tracks import Tracks, errors, read_tracks, rebuilt, usual
 
 ROUNDS, FEWER = 3, 2  # of patches and adjustment; where features are precise already
-UNSURE = 0.3  # px of what SIFT sees that observations are usually off, from where on photos may be bad
 ALWAYS_CHECKED = 16  # photos, whose places are always checked
 LAID = 400  # observations of a photo, of the points whose patches are laid
-ROBUST = 2.0  # medians of the errors, from where on one counts less
-CELL = 2.0  # px, where points are the same
-GROWN = 1.3  # times: patches that leave the observations so much farther off do not fit these photos
 ANGLE = pycolmap.IncrementalMapperOptions().filter_min_tri_angle  # degrees between two rays to a point, least
 
 Adjust = Callable[[pycolmap.Reconstruction, float, bool], None]
@@ -53,7 +49,7 @@ def refined(
     """
     work.tell("sharpen", 0)
     sides = [max(camera.width, camera.height) for camera in plain.cameras.values()]
-    unsure = usual(plain) * min(1, largest / float(np.median(sides))) > UNSURE
+    unsure = usual(plain) * min(1, largest / float(np.median(sides))) > 0.3  # px; photos may be bad
     model, all_sure = plain, sure >= placed_names(plain)
     for _ in range(1 if all_sure else 2):  # weaker evidence: farther off
         rounds = ROUNDS if unsure else FEWER
@@ -100,7 +96,7 @@ def sharpened(
     photos = dict(zip(names, read_photos(folder, names, threads), strict=True))
     before = usual(model)
     sides = [max(camera.width, camera.height) for camera in model.cameras.values()]
-    used, fresh = _used(tracks, len(names), CELL * max(1, float(np.median(sides)) / PATCH_SIDE))
+    used, fresh = _used(tracks, len(names), 2 * max(1, float(np.median(sides)) / PATCH_SIDE))
     now, some = rebuilt(model, names, tracks), tracks.chosen(used[tracks.point])
     for number in range(rounds):
         views = [PatchView(now, name, photos[name]) for name in names]
@@ -111,13 +107,13 @@ def sharpened(
         if 2 * unlike.sum() > len(names):
             return model
         now = rebuilt(now, names, some.chosen(sure))
-        adjust(now, ROBUST * float(np.median(errors(now))), True)
+        adjust(now, 2 * float(np.median(errors(now))), True)
         (_, some), off = read_tracks(now), errors(now)
         own = np.array([np.median([0, *off[some.view == k]]) for k in range(len(names))])
         some = some.chosen(off <= OUTLIER * np.maximum(own, np.median(off))[some.view])
     now = rebuilt(now, names, some)
     pycolmap.ObservationManager(now).filter_all_points3D(1e9, ANGLE)
-    if usual(now) > GROWN * before:
+    if usual(now) > 1.3 * before:  # these photos do not bear out the patches
         return model
     return _joined(now, names, tracks.chosen((fresh & ~used)[tracks.point]), adjust, OUTLIER * before)
 

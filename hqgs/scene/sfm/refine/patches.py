@@ -20,8 +20,6 @@ from hqgs.photos.pixels import grey
 from hqgs.scene.sfm.refine.tracks import Floats, Tracks, seen_at
 
 HALF = 6  # nodes of a patch to each side of its middle
-WINDOW = 3.5  # nodes, sigma of the weights over a patch
-SMOOTH = 1.0  # px, sigma, of the photos that patches are taken from
 PATCH_SIDE = 1000  # px, of these photos
 PATCH_STEPS, STILL = 5, 0.05  # of Gauss-Newton, at most; nodes, the usual step after which none follows
 REACH = 3.0  # px that an observation may move
@@ -43,7 +41,7 @@ def read_photos(folder: Path, names: Sequence[str], threads: int) -> list[NDArra
                 size = max(1, round(gray.width * share)), max(1, round(gray.height * share))
                 gray = gray.resize(size, Image.Resampling.BOX)
             values = np.asarray(gray, np.float32)
-        return np.asarray(gaussian_filter(values, SMOOTH, mode="nearest"), np.float32)
+        return np.asarray(gaussian_filter(values, 1.0, mode="nearest"), np.float32)
 
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(read, names))
@@ -94,7 +92,7 @@ def axes_of(views: list[PatchView], tracks: Tracks) -> Floats:
 
 
 _GRID = np.stack(np.meshgrid(*[np.arange(-HALF, HALF + 1.0)] * 2, indexing="xy"), -1).reshape(-1, 2)  # x, y
-_WEIGHTS = np.exp(-np.square(_GRID).sum(1) / (2 * WINDOW**2))
+_WEIGHTS = np.exp(-np.square(_GRID).sum(1) / (2 * 3.5**2))
 _WEIGHTS = (_WEIGHTS / _WEIGHTS.sum()).astype(np.float32)
 
 
