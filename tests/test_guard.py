@@ -229,7 +229,7 @@ def test_what_the_guard_knows_outlives_a_checkpoint(faulty: Faulty, tmp_path: Pa
     again = Trainer(tiny_scene(), tiny_config(method="faulty"))
     again.restore(tmp_path / CHECKPOINT)
     assert again.guard == trainer.state.guard
-    assert again.guard.culled == 1
+    assert again.state.guard.culled == 1
     assert len(again.gaussians) == 39
 
 
