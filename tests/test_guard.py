@@ -218,7 +218,8 @@ def test_many_events_are_counted_and_the_first_kept(faulty: Faulty) -> None:
     assert trainer.state.guard.num_events == EVENTS_KEPT + 5
     assert [e["iteration"] for e in trainer.state.guard.events] == list(range(1, 2 * EVENTS_KEPT, 2))
     assert all(
-        e["gaussians"] == list(range(GAUSSIANS_LISTED)) and e["count"] == 15 for e in trainer.state.guard.events
+        e["gaussians"] == list(range(GAUSSIANS_LISTED)) and e["count"] == 15
+        for e in trainer.state.guard.events
     )
 
 
