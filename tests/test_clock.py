@@ -197,14 +197,16 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
     asked = trainer(iterations=9_000)
     assert asked.config.iterations == 9_000
     assert "asked for; with 7 photos more than 4,000 seldom improve the scene" in [
-        row.why for row in asked.rows
+        row.why for row in asked.plan.rows
     ]
-    assert "asked for" in [row.why for row in trainer(iterations=4_000).rows if row.what == "length"]
+    assert "asked for" in [row.why for row in trainer(iterations=4_000).plan.rows if row.what == "length"]
     assert trainer(leave_out="none").config.iterations == 30_000
     assert trainer(method="3dgs").config.iterations == 30_000
     noisy = Trainer(scene, run_config(formation="noise:20"))  # 7 photos, of which none can be held back
     assert noisy.config.iterations == 7_000
-    assert "no validation photo can be set aside to find the best length" in [row.why for row in noisy.rows]
+    assert "no validation photo can be set aside to find the best length" in [
+        row.why for row in noisy.plan.rows
+    ]
     for name in ("ENOUGH", "LEAST_ENOUGH"):
         monkeypatch.setattr(f"hqgs.training.rules.{name}", 700)
     many = trainer()

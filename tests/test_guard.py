@@ -104,10 +104,14 @@ def test_gaussians_with_a_bad_gradient_are_named_and_culled(
             "gaussians": [3, 17],
         }
     ]
-    assert (trainer.state.guard.skipped, trainer.guard.culled) == (1, 2)
+    assert (trainer.state.guard.skipped, trainer.state.guard.culled) == (1, 2)
     for _ in range(20):
         trainer.step()
-    assert (trainer.state.guard.skipped, trainer.guard.culled, trainer.guard.num_events) == (1, 2, 1)
+    assert (trainer.state.guard.skipped, trainer.state.guard.culled, trainer.state.guard.num_events) == (
+        1,
+        2,
+        1,
+    )
     assert all(bool(torch.isfinite(t).all()) for t in values(trainer).values())
 
 
@@ -203,7 +207,7 @@ def test_a_method_s_own_gradient_is_named_and_costs_no_gaussian(faulty: Faulty) 
     trainer = run_until(Trainer(tiny_scene(), tiny_config(method="faulty", densify=ONLY_TRAIN)), 6)
     (event,) = trainer.state.guard.events
     assert (event["what"], event["tensors"], event["count"]) == ("gradient", ["offset"], 0)
-    assert (trainer.state.guard.skipped, trainer.guard.culled, len(trainer.gaussians)) == (1, 0, 40)
+    assert (trainer.state.guard.skipped, trainer.state.guard.culled, len(trainer.gaussians)) == (1, 0, 40)
 
 
 def test_many_events_are_counted_and_the_first_kept(faulty: Faulty) -> None:
@@ -229,7 +233,7 @@ def test_what_the_guard_knows_outlives_a_checkpoint(faulty: Faulty, tmp_path: Pa
     trainer.save(tmp_path / CHECKPOINT)
     again = Trainer(tiny_scene(), tiny_config(method="faulty"))
     again.restore(tmp_path / CHECKPOINT)
-    assert again.guard == trainer.state.guard
+    assert again.state.guard == trainer.state.guard
     assert again.state.guard.culled == 1
     assert len(again.gaussians) == 39
 

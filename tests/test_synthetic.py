@@ -383,7 +383,10 @@ def test_what_is_installed_is_what_is_ray_cast() -> None:
         np.testing.assert_array_equal(views[k].camera.K, camera.K)
         # products of matrices are rounded as the CPU's BLAS does
         np.testing.assert_allclose(views[k].camera.viewmat, camera.viewmat, rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(views[5].image, render_view(embedded_cameras()[5]))
+    # so is light, and seldom another level comes of it
+    levels = np.abs(views[5].image.astype(int) - render_view(embedded_cameras()[5]))
+    assert levels.max() <= 1
+    assert np.count_nonzero(levels) <= 3
     assert made.seen is not None
     assert np.median(depth_error([views[5]], made.points[made.seen["view_05.png"]])) < 0.01
     small = room.embedded_scene(63, 47)
