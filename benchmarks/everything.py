@@ -10,7 +10,7 @@ import argparse
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from shutil import copyfile
 from subprocess import Popen
@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> list[str]:
 
 def side_by_side(
     studies: Mapping[str, list[str]], jobs: int, more: Sequence[str]
-) -> Iterator[tuple[str, int, float]]:
+) -> Generator[tuple[str, int, float], None, None]:
     """Run studies, so many at a time; the name, exit code and seconds of each as it ends."""
     left, running = list(studies), dict[str, tuple[Popen[bytes], float]]()
     try:
