@@ -40,12 +40,13 @@ class Looks(NamedTuple):
     photos: int  # at most
     side: int  # px of the copies
     steps: int  # of each short run
+    each: int  # photo is half held back
 
 
 # A photo's own shake is learned after 20 looks at it, and seen where it has a pixel: in copies of 120 px that
 # of the built-in room gains nothing, in 240 px 0.8 dB. Photos gain so differently that it takes many to tell.
 # Focus takes more looks than a short run has: there the diagnosis decides.
-LOOKS = (Looks(("exposure", "vignetting", "response"), 1000, 120, 200), Looks(("shake",), 16, 240, 320))
+LOOKS = (Looks(("exposure", "vignetting", "response"), 1000, 120, 200, 4), Looks(("shake",), 16, 240, 320, 2))
 EACH, OFFSETS = 4, (1, 3)  # every so-manieth photo is held back, from these on, one after the other
 STEPS, SIDES = 400, (80, 320)  # of each short run; px of the copies, at least and at most
 SHARE = 0.05  # of the pixels that the run trains on: those of the trial of growth
@@ -122,7 +123,7 @@ def tried_looks(
             continue
         views = [shrunk(scene.train[k], group.side) for k in evenly(len(scene.train), group.photos)]
         views.sort(key=lambda view: view.device)  # some of each camera's are held back
-        held = {k: views[k] for k in range(1, len(views), 2)}  # few photos leave few to tell by
+        held = {k: views[k] for k in range(OFFSETS[0], len(views), group.each)}
         halves = [_half_shown(view) if k in held else view for k, view in enumerate(views)]
         config = _settings(settings, len(views), NONE, group.steps)
         run = begin(replace(scene, train=halves, test=[]), config)
