@@ -183,7 +183,7 @@ def test_a_look_is_kept_where_photos_held_back_gain_by_it() -> None:
     asked = replace(ASKED, hqgs=replace(ASKED.hqgs, formation=formation))
     found = trial.tried_looks(replace(scene, train=train), asked, (), begin, stages.append)  # type: ignore[arg-type]
     assert [run.tried for run in runs] == [[*FakeLooks.off], [*FakeLooks.blurred]]
-    assert {name: tried.keeps for name, tried in found.items()} == {
+    assert {name: tried.pays for name, tried in found.items()} == {
         "exposure": True, "vignetting": False, "response": True, "shake": True,
     }  # fmt: skip
     assert found["exposure"].gain == pytest.approx(20 * np.log10(2), abs=0.6)
@@ -191,7 +191,7 @@ def test_a_look_is_kept_where_photos_held_back_gain_by_it() -> None:
     assert trial.tried_looks(scene, ASKED, (), begin) == {}  # type: ignore[arg-type]
     runs.clear()
     certain = trial.tried_looks(replace(scene, train=train), asked, ("vignetting",), begin)  # type: ignore[arg-type]
-    assert [name for name, tried in certain.items() if tried.keeps] == ["exposure", "response", "shake"]
+    assert [name for name, tried in certain.items() if tried.pays] == ["exposure", "response", "shake"]
     assert {one for run in runs for one in run.tried} == set(FakeLooks.certain)
 
 

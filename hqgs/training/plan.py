@@ -38,11 +38,6 @@ class Tried:
         """Whether the gain is more than photos scatter."""
         return self.gain > SCATTER and self.sure > 1
 
-    @property
-    def keeps(self) -> bool:
-        """Whether a look is learned: photos gain more than they differ."""
-        return self.sure > 1
-
     def __str__(self) -> str:
         return f"{self.gain:+.2f} ± {self.error:.2f} dB on {self.photos} validation photos of short test runs"
 

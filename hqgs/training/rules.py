@@ -146,7 +146,7 @@ def formation(draft: Draft) -> None:
         raise ValueError("formation is auto, which needs a diagnosis of the photos; got None")
     else:
         looks = draft.facts.looks
-        out = {name for name, tried in looks.items() if not tried.keeps}
+        out = {name for name, tried in looks.items() if not tried.pays}
         steps = [str(step) for step in parse_formation(diagnosis.formation).steps if step.kind not in out]
         text = str(parse_formation("+".join(steps) or NONE))
         found = [

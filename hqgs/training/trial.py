@@ -133,7 +133,7 @@ def tried_looks(
             others = _with_looks(run, [*kept, kind], held, told)
             if (tried := _of_gains(others - best)) is not None:
                 found[kind] = tried
-                best, kept = (others, [*kept, kind]) if tried.keeps else (best, kept)
+                best, kept = (others, [*kept, kind]) if tried.pays else (best, kept)
     return found
 
 
