@@ -67,6 +67,7 @@ def _closes(path: Path) -> bool:
     apart = np.abs(np.diff(pixels, axis=1)).mean((0, 2))
     seam = np.abs(pixels[:, 0] - pixels[:, -1]).mean()
     poles, border = pixels[[0, -1]].std(1).mean(1), pixels[:, 0].std(0).mean()
+    # the last column and the first are neighbours; the first row and the last show a point each
     joined, poles_plain = seam <= 2 * np.median(apart), (poles <= POLE * contrast).all()
     return bool(joined and poles_plain and border > PLAIN * contrast)
 

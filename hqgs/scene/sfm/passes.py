@@ -171,9 +171,8 @@ class Work:
         options.min_model_size = LEAST_PHOTOS
         mapper = options.mapper
         if self.quick:
-            options.ba_global_frames_ratio = options.ba_global_points_ratio = (
-                1.3  # of what was found coarsely
-            )
+            # of what was found coarsely, all is adjusted seldom
+            options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
             options.ba_global_max_refinements = 2
         options.ba_refine_sensor_from_rig = False
         if self.fixed:

@@ -96,6 +96,7 @@ def sharpened(
     photos = dict(zip(names, read_photos(folder, names, threads), strict=True))
     before = usual(model)
     sides = [max(camera.width, camera.height) for camera in model.cameras.values()]
+    # points nearer than 2 px are the same
     used, fresh = _used(tracks, len(names), 2 * max(1, float(np.median(sides)) / PATCH_SIDE))
     now, some = rebuilt(model, names, tracks), tracks.chosen(used[tracks.point])
     for number in range(rounds):

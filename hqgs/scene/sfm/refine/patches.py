@@ -92,7 +92,7 @@ def axes_of(views: list[PatchView], tracks: Tracks) -> Floats:
 
 
 _GRID = np.stack(np.meshgrid(*[np.arange(-HALF, HALF + 1.0)] * 2, indexing="xy"), -1).reshape(-1, 2)  # x, y
-_WEIGHTS = np.exp(-np.square(_GRID).sum(1) / (2 * 3.5**2))
+_WEIGHTS = np.exp(-np.square(_GRID).sum(1) / (2 * 3.5**2))  # sigma of 3.5 nodes
 _WEIGHTS = (_WEIGHTS / _WEIGHTS.sum()).astype(np.float32)
 
 
