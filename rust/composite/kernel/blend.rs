@@ -17,6 +17,27 @@ struct Way<S: Simd, T: Real, const D: usize, const V: usize> {
 }
 
 impl<S: Simd, T: Real, const D: usize, const V: usize> Way<S, T, D, V> {
+    /// Meet the layers of `part`, whose number is a multiple of N: N at a time, as many as fit into the registers.
+    #[inline(always)]
+    fn meet_all<const N: usize>(
+        &mut self,
+        simd: S,
+        decision: &Decision<S, T>,
+        layers: &Layers<T>,
+        part: &[u32],
+        pixels: [[Lanes<T, S>; V]; 2],
+        colors: &mut [Pixels<T>],
+        at: usize,
+    ) {
+        let channels = if D > 0 { D } else { layers.channels };
+        for part in part.as_chunks::<N>().0 {
+            for (alpha, &k) in layers.alphas(simd, part, pixels).into_iter().zip(part) {
+                let rgb = &layers.colors[k as usize * channels..][..channels];
+                self.meet(simd, decision, alpha, rgb, colors, at);
+            }
+        }
+    }
+
     /// Meet one layer. With D = 0 the colours lie in `colors`, from `at` on.
     #[inline(always)]
     fn meet(
@@ -73,30 +94,11 @@ pub fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
         sums: [[zero; V]; D],
     };
     let mut evaluated = 0;
-    let rgb = |k: u32| &layers.colors[k as usize * channels..(k as usize + 1) * channels];
     for part in layers.list.chunks(STRIDE) {
-        match <&[u32; STRIDE]>::try_from(part) {
-            Ok(part) if V == 1 => {
-                let [a, b, c, d] = layers.alphas(simd, part, pixels);
-                way.meet(simd, &decision, a, rgb(part[0]), colors, at);
-                way.meet(simd, &decision, b, rgb(part[1]), colors, at);
-                way.meet(simd, &decision, c, rgb(part[2]), colors, at);
-                way.meet(simd, &decision, d, rgb(part[3]), colors, at);
-            }
-            Ok(part) if V == 2 => {
-                let [a, b] = layers.alphas(simd, &[part[0], part[1]], pixels);
-                way.meet(simd, &decision, a, rgb(part[0]), colors, at);
-                way.meet(simd, &decision, b, rgb(part[1]), colors, at);
-                let [a, b] = layers.alphas(simd, &[part[2], part[3]], pixels);
-                way.meet(simd, &decision, a, rgb(part[2]), colors, at);
-                way.meet(simd, &decision, b, rgb(part[3]), colors, at);
-            }
-            _ => {
-                for &k in part {
-                    let [alpha] = layers.alphas(simd, &[k], pixels);
-                    way.meet(simd, &decision, alpha, rgb(k), colors, at);
-                }
-            }
+        match (part.len(), V) {
+            (STRIDE, 1) => way.meet_all::<4>(simd, &decision, &layers, part, pixels, colors, at),
+            (STRIDE, 2) => way.meet_all::<2>(simd, &decision, &layers, part, pixels, colors, at),
+            _ => way.meet_all::<1>(simd, &decision, &layers, part, pixels, colors, at),
         }
         evaluated += part.len();
         if decision.finished(&way.open) {
