@@ -115,7 +115,7 @@ def colors(rng: np.random.Generator, looks: list[Look], scatter: float) -> Share
         logs[k] = np.log(to_linear(value)) + rng.normal(0, scatter, (points, 3))
     hidden = rng.random((count, points)) < 0.5
     logs[hidden], squares[hidden] = np.nan, np.nan
-    return SharedColors(logs, squares)
+    return SharedColors(logs, squares, rng.normal(0, 0.1, squares.shape))
 
 
 def test_vignetting_and_response_are_found() -> None:
@@ -140,6 +140,21 @@ def test_vignetting_and_response_are_found() -> None:
     ]  # told apart from what cameras do
     with_them, without = (np.abs(found - own).mean() for found in off if found is not None)
     assert without < 0.4 * with_them
+
+
+def test_light_that_falls_off_with_depth_is_no_lens() -> None:
+    """On a walk, where points come to the rim as they come nearer: with a lens and without."""
+    rng, views = np.random.default_rng(2), [view(k, "a") for k in range(16)]
+    for fall in (0.0, 0.5):
+        plain = colors(rng, [Look(np.ones(3), np.array([fall, 0.0]), np.zeros((2, 3)))] * 16, 0.05)
+        depths = rng.normal(-0.4 * np.log(plain.squares + 0.05), 0.05)
+        walk = SharedColors(plain.logs + 0.3 * depths[..., None], plain.squares, depths)
+        signs, unaware = (device_signs(views, one) for one in (walk, replace(walk, depths=0 * depths)))
+        assert signs is not None
+        assert unaware is not None
+        assert unaware.vignetting.certain
+        assert signs.vignetting.needed == (fall > 0)
+        assert abs(signs.vignetting.size - fall) < 0.1
 
 
 @pytest.mark.parametrize("scatter", [0.01, 0.3])

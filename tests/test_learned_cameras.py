@@ -348,10 +348,11 @@ def test_a_points_colour_is_that_of_its_own_pixels(x: float, y: float) -> None:
     depth = 2.0
     points = np.array([[(x - width / 2) * depth / focal, (y - height / 2) * depth / focal, depth]])
     colors = np.full((3, 3), np.nan)
-    squares = np.full(3, np.nan)
-    gains._note_colors(view, points, np.array([1]), colors, squares)  # pyright: ignore[reportPrivateUsage]
+    squares, depths = np.full((2, 3), np.nan)
+    gains._note_colors(view, points, np.array([1]), colors, squares, depths)  # pyright: ignore[reportPrivateUsage]
     expected = (0.1 + 0.005 * x + 0.015 * y) * np.array([1.0, 0.9, 0.8])
     np.testing.assert_allclose(colors[1], expected, rtol=1e-4)
     assert np.isnan(colors[[0, 2]]).all()
     away = (x - width / 2) ** 2 + (y - height / 2) ** 2  # half the diagonal is 1
     np.testing.assert_allclose(squares[1], away / (width**2 + height**2) * 4)
+    assert depths[1] == np.log(depth)

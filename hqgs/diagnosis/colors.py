@@ -46,7 +46,8 @@ MOST: dict[str, float] = {
 }  # beyond, no lens and no sensor does so
 SURE = 3
 # Standard errors from which a short run, which differs by more than vignetting gains, is not asked. What was
-# put on three captures, 0.3 and above, is told by 7 to 50; what a street's changing light feigns by 4 to 5.
+# put on three captures, 0.3 and above, is told by 7 to 50; what a street's changing light feigns by 4 to 5;
+# what a walk feigns, on which points near the rim are nearer, by 0.8 with depths told apart, else by 9.
 CERTAIN = 6
 DEVICE_PHOTOS, DEVICES_MOST = 4, 16  # that a camera must have taken; cameras that are told apart
 ROWS = 12_000  # colours of points in photos that are looked at
@@ -66,6 +67,7 @@ class SharedColors:
 
     logs: Floats  # [N, P, 3], of the light of red, green and blue; NaN where a photo does not tell
     squares: Floats  # [N, P], r^2 where it shows them, see `hqgs.photos.look`; NaN too
+    depths: Floats  # [N, P], the logarithm of how far ahead of it they are; any where it does not tell
 
 
 def shared_colors(scene: Scene) -> SharedColors | None:
@@ -75,19 +77,19 @@ def shared_colors(scene: Scene) -> SharedColors | None:
         return None
     chosen = _chosen_points(scene, scene.seen)
     colors = np.full((len(scene.train), len(chosen), 3), np.nan)
-    squares = np.full(colors.shape[:2], np.nan)
+    squares, depths = np.full((2, *colors.shape[:2]), np.nan)
     for k, view in enumerate(scene.train):
         rows = np.flatnonzero(np.isin(chosen, scene.seen.get(view.name, [])))
         if len(rows):
             points = scene.points[chosen[rows]].astype(np.float64)
-            _note_colors(view, points, rows, colors[k], squares[k])
+            _note_colors(view, points, rows, colors[k], squares[k], depths[k])
     told = np.isfinite(colors).all(2)
     told &= told.sum(0) >= 2
     if told.sum(1).min() < JOINT:
         return None
     with np.errstate(invalid="ignore"):
         logs = np.log(np.where(told[..., None], colors, np.nan))
-    return SharedColors(logs, np.where(told, squares, np.nan))
+    return SharedColors(logs, np.where(told, squares, np.nan), depths)
 
 
 def log_gains(scene: Scene, shared: SharedColors | None = None) -> Floats | None:
@@ -118,12 +120,15 @@ def _chosen_points(scene: Scene, seen: Mapping[str, NDArray[np.intp]]) -> NDArra
     return most_shown(len(scene.points), seen, scene.train, MOST_VALUES // len(scene.train))
 
 
-def _note_colors(view: View, points: Floats, rows: NDArray[np.intp], colors: Floats, squares: Floats) -> None:
-    """Write the light of a photo at `points`, which have these `rows`, and their r^2; NaN where it does not
-    tell."""
+def _note_colors(
+    view: View, points: Floats, rows: NDArray[np.intp], colors: Floats, squares: Floats, depths: Floats
+) -> None:
+    """Write the light of a photo at `points`, which have these `rows`, their r^2 and the logarithms of their
+    depths; NaN where it does not tell."""
     camera = view.camera
-    where, depths = project(camera, points)
-    rows, where = rows[depths > 0], where[depths > 0]
+    where, ahead = project(camera, points)
+    rows, where, ahead = rows[ahead > 0], where[ahead > 0], ahead[ahead > 0]
+    depths[rows] = np.log(ahead)
     away = np.square(where - camera.K[:2, 2]).sum(1)
     squares[rows] = away * (4 / (camera.height**2 + camera.width**2))
     if view.image.dtype == np.uint8:  # 256 powers, not one for each value
@@ -260,15 +265,20 @@ def device_signs(views: Sequence[View], shared: SharedColors) -> DeviceSigns | N
     if not count:
         return None
     table = _Table.of(shared, of_photo)
-    lens = Fit(np.zeros((count, 2)), np.zeros((count, 2, 2)))
+    lens = nearer = Fit(np.zeros((count, 2)), np.zeros((count, 2, 2)))
     sensors = [lens] * 3  # of red, green and blue
     for _ in range(BENT if count > 1 else 1):
-        lens, sensors = table.cameras(lens, sensors)
-    corners = zip(lens.found.sum(1), np.sqrt(lens.covariance.sum((1, 2))), strict=True)
-    darker = _surest([Sign("vignetting", *corner) for corner in corners])
+        lens, nearer, sensors = table.cameras(lens, sensors)
+    darker = min(map(_corners, (lens, nearer)), key=lambda sign: sign.size - SURE * sign.error)
     bent = _surest([sign for sensor in sensors for sign in _bends(sensor)]) if count > 1 else None
     response = as_responses(np.stack([sensor.found for sensor in sensors], 2))
     return DeviceSigns(Devices(of_photo, as_a_lens(lens.found), response), darker, bent)
+
+
+def _corners(lens: Fit) -> Sign:
+    """How much darker the corners are, of the camera of which that is surest."""
+    corners = zip(lens.found.sum(1), np.sqrt(lens.covariance.sum((1, 2))), strict=True)
+    return _surest([Sign("vignetting", *corner) for corner in corners])
 
 
 def _bends(sensor: Fit) -> Iterator[Sign]:
@@ -314,6 +324,7 @@ class _Table:
     device: Numbers  # [M]
     logs: Floats  # [M, 3]
     squares: Floats  # [M]
+    depths: Floats  # [M]
 
     @staticmethod
     def of(shared: SharedColors, of_photo: Numbers) -> _Table:
@@ -322,8 +333,9 @@ class _Table:
         most = max(ROWS * len(points) // max(int(told[:, points].sum()), 1), 1)
         points = points[evenly(len(points), most)]
         photo, point = np.nonzero(told[:, points])
-        logs, squares = shared.logs[photo, points[point]], shared.squares[photo, points[point]]
-        return _Table(of_photo, photo, point, of_photo[photo], logs, squares)
+        of = photo, points[point]
+        seen = shared.logs[of], shared.squares[of], shared.depths[of]
+        return _Table(of_photo, photo, point, of_photo[photo], *seen)
 
     def means(self, logs: Floats) -> tuple[Floats, Floats]:
         """A colour of each point [P, 3] and a level of each photo [N, 3] whose sums are these rows' best."""
@@ -333,18 +345,20 @@ class _Table:
             level = _mean(logs - colors[self.point], self.photo, len(level))
         return colors, level
 
-    def cameras(self, lens: Fit, sensors: Sequence[Fit]) -> tuple[Fit, list[Fit]]:
-        """What lenses (k1, k2) and sensors (a, b; of mean 0 over photos) do, told from first guesses."""
+    def cameras(self, lens: Fit, sensors: Sequence[Fit]) -> tuple[Fit, Fit, list[Fit]]:
+        """What lenses (k1, k2) and sensors (a, b; of mean 0 over photos) do, told from first guesses; lenses
+        also if a point's light may change by a power of its depth."""
         taken = self.device >= 0
         response = np.stack([sensor.found for sensor in sensors], 2)
         own = np.where(taken[:, None, None], response[self.device], 0)
         straight = straightened(self.logs, own)
         radii = -np.stack([self.squares, self.squares**2], 1)
         lens = self.fit(straight.mean(1), radii, HOLDS_LENS)
+        nearer = self.fit(straight.mean(1), radii, HOLDS_LENS, self.depths)
         fall = np.where(taken, (radii * as_a_lens(lens.found)[self.device]).sum(1), 0)[:, None]
         counts = np.bincount(self.of_photo[self.of_photo >= 0])
         if len(counts) == 1:
-            return lens, [*sensors]
+            return lens, nearer, [*sensors]
         # at what the other photos let expect: a photo's own noise would be taken for a response
         colors, level = self.means(straight - fall)
         value = to_srgb(np.exp(colors[self.point] + level[self.photo] + fall))
@@ -352,24 +366,27 @@ class _Table:
         basis = np.stack([slope, slope * (1 - 2 * value)], 1)  # [M, 2, 3]
         logs = straight - fall + (basis * own).sum(1)
         fits = [self.fit(logs[:, c], basis[..., c], (HOLDS_RESPONSE,) * 2) for c in range(3)]
-        return lens, [fit._replace(found=fit.found - counts @ fit.found / counts.sum()) for fit in fits]
+        sensors = [fit._replace(found=fit.found - counts @ fit.found / counts.sum()) for fit in fits]
+        return lens, nearer, sensors
 
-    def fit(self, logs: Floats, basis: Floats, holds: Sequence[float]) -> Fit:
+    def fit(self, logs: Floats, basis: Floats, holds: Sequence[float], beside: Floats | None = None) -> Fit:
         """What each camera adds to `logs` [M], by parameters of `basis` [M, K].
 
-        Beside a gain of each photo and a colour of each point. Least absolute errors, each point's in shares
-        of its own; `holds` [K], of the weights, keep parameters small. Covariances are those of errors that
-        go together within photos and within points (Cameron, Gelbach and Miller 2011).
+        Beside a gain of each photo, a colour of each point and a multiple of `beside` [M]. Least absolute
+        errors, each point's in shares of its own; `holds` [K], of the weights, keep parameters small; the
+        first one `beside` too. Covariances are those of errors that go together within photos and within
+        points (Cameron, Gelbach and Miller 2011).
         """
         count, photo, point = int(self.of_photo.max()) + 1, self.photo, self.point
         own = self.device[:, None] == np.arange(count)
-        both = np.column_stack([logs, (own[..., None] * basis[:, None]).reshape(len(logs), -1)])
-        weights, found = np.ones(len(logs)), np.zeros(count * len(holds))
+        columns = [logs, (own[..., None] * basis[:, None]).reshape(len(logs), -1)]
+        both = np.column_stack(columns if beside is None else [*columns, beside])
+        weights, found = np.ones(len(logs)), np.zeros(both.shape[1] - 1)
         small, covariance = np.ones(len(logs), bool), np.zeros((len(found), len(found)))
         for _ in range(DEVICE_WEIGHTED):
             left = _within(both, photo, point, weights)
             y, X = left[:, 0], left[:, 1:]
-            held = np.diag(np.tile(holds, count)) * weights.sum()
+            held = np.diag(np.resize(holds, len(found))) * weights.sum()
             found = np.linalg.solve(X.T @ (weights[:, None] * X) + held, X.T @ (weights * y))
             rest = y - X @ found
             scores = (weights * rest)[:, None] * X
@@ -383,8 +400,8 @@ class _Table:
             small = rest < of_point / 2
             weights = 1 / (np.maximum(rest, of_point / 2) * of_point)
             weights /= weights.mean()
-        errors = covariance.reshape(count, len(holds), count, len(holds))
-        return Fit(found.reshape(count, -1), np.stack([errors[d, :, d] for d in range(count)]))
+        rows = np.arange(count * len(holds)).reshape(count, -1)
+        return Fit(found[rows], np.stack([covariance[np.ix_(at, at)] for at in rows]))
 
 
 def _sums(values: Floats, at: Numbers, count: int) -> Floats:
