@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -55,8 +55,6 @@ ROWS = 12_000  # colours of points in photos that are looked at
 DEVICE_ROUNDS, DEVICE_WEIGHTED, BENT = (8, 6, 3)
 # Of the weights: what no photo tells stays 0. Points that tell r^2 hardly tell r^4 beside it.
 HOLDS_LENS, HOLDS_RESPONSE = (1e-7, 1e-4), 1e-4
-
-
 UNLIKE_GAINS = 0.05  # of the log gains: what is learned
 ROUNDS = 30  # of means and medians of photos and points in turn
 
@@ -75,7 +73,8 @@ def shared_colors(scene: Scene) -> SharedColors | None:
     JOINT with others (dark and saturated ones do not count)."""
     if scene.seen is None or len(scene.train) < 3:
         return None
-    chosen = _chosen_points(scene, scene.seen)
+    # all, or where memory is short those that most photos show
+    chosen = most_shown(len(scene.points), scene.seen, scene.train, MOST_VALUES // len(scene.train))
     colors = np.full((len(scene.train), len(chosen), 3), np.nan)
     squares, depths = np.full((2, *colors.shape[:2]), np.nan)
     for k, view in enumerate(scene.train):
@@ -113,11 +112,6 @@ def log_gains(scene: Scene, shared: SharedColors | None = None) -> Floats | None
             gains = np.nanmedian(logs - own, axis=1)
             gains -= gains.mean(0)
     return _apart(scene.train, gains)
-
-
-def _chosen_points(scene: Scene, seen: Mapping[str, NDArray[np.intp]]) -> NDArray[np.intp]:
-    """Rows of the points to look at, rising: all, or where memory is short those that most photos show."""
-    return most_shown(len(scene.points), seen, scene.train, MOST_VALUES // len(scene.train))
 
 
 def _note_colors(
@@ -333,9 +327,8 @@ class _Table:
         most = max(ROWS * len(points) // max(int(told[:, points].sum()), 1), 1)
         points = points[evenly(len(points), most)]
         photo, point = np.nonzero(told[:, points])
-        of = photo, points[point]
-        seen = shared.logs[of], shared.squares[of], shared.depths[of]
-        return _Table(of_photo, photo, point, of_photo[photo], *seen)
+        of, parts = (photo, points[point]), (shared.logs, shared.squares, shared.depths)
+        return _Table(of_photo, photo, point, of_photo[photo], *(part[of] for part in parts))
 
     def means(self, logs: Floats) -> tuple[Floats, Floats]:
         """A colour of each point [P, 3] and a level of each photo [N, 3] whose sums are these rows' best."""
@@ -354,7 +347,7 @@ class _Table:
         straight = straightened(self.logs, own)
         radii = -np.stack([self.squares, self.squares**2], 1)
         lens = self.fit(straight.mean(1), radii, HOLDS_LENS)
-        nearer = self.fit(straight.mean(1), radii, HOLDS_LENS, self.depths)
+        nearer = self.fit(straight.mean(1), radii, HOLDS_LENS, [self.depths])
         fall = np.where(taken, (radii * as_a_lens(lens.found)[self.device]).sum(1), 0)[:, None]
         counts = np.bincount(self.of_photo[self.of_photo >= 0])
         if len(counts) == 1:
@@ -369,18 +362,17 @@ class _Table:
         sensors = [fit._replace(found=fit.found - counts @ fit.found / counts.sum()) for fit in fits]
         return lens, nearer, sensors
 
-    def fit(self, logs: Floats, basis: Floats, holds: Sequence[float], beside: Floats | None = None) -> Fit:
+    def fit(self, logs: Floats, basis: Floats, holds: Sequence[float], beside: Sequence[Floats] = ()) -> Fit:
         """What each camera adds to `logs` [M], by parameters of `basis` [M, K].
 
-        Beside a gain of each photo, a colour of each point and a multiple of `beside` [M]. Least absolute
-        errors, each point's in shares of its own; `holds` [K], of the weights, keep parameters small; the
-        first one `beside` too. Covariances are those of errors that go together within photos and within
-        points (Cameron, Gelbach and Miller 2011).
+        Beside a gain of each photo, a colour of each point and multiples of `beside`, each [M]. Least
+        absolute errors, each point's in shares of its own; `holds` [K], of the weights, keep parameters
+        small, the first those of `beside` too. Covariances are those of errors that go together within photos
+        and within points (Cameron, Gelbach and Miller 2011).
         """
         count, photo, point = int(self.of_photo.max()) + 1, self.photo, self.point
         own = self.device[:, None] == np.arange(count)
-        columns = [logs, (own[..., None] * basis[:, None]).reshape(len(logs), -1)]
-        both = np.column_stack(columns if beside is None else [*columns, beside])
+        both = np.column_stack([logs, (own[..., None] * basis[:, None]).reshape(len(logs), -1), *beside])
         weights, found = np.ones(len(logs)), np.zeros(both.shape[1] - 1)
         small, covariance = np.ones(len(logs), bool), np.zeros((len(found), len(found)))
         for _ in range(DEVICE_WEIGHTED):
