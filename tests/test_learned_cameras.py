@@ -22,7 +22,7 @@ from hqgs.diagnosis.colors import UNLIKE_GAINS, log_gains
 from hqgs.diagnosis.differences import TURNED, UNLIKE, unlike_sharpness
 from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.light import to_linear, to_srgb
-from hqgs.scene.geometry import project
+from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.config import HQGSConfig
 from hqgs.training.methods.cameras import LearnedCameras, take_photo
@@ -183,8 +183,10 @@ def test_gains_of_many_photos_come_from_the_points_that_most_of_them_show(
     shown = np.bincount(np.concatenate([scene.seen[view.name] for view in scene.train]))
     most = 200
     monkeypatch.setattr(gains, "MOST_VALUES", most * len(scene.train))
-    chosen = gains._chosen_points(scene, scene.seen)  # pyright: ignore[reportPrivateUsage]
-    assert len(chosen) == most < len(scene.points)
+    shared = gains.shared_colors(scene)
+    assert shared is not None
+    assert shared.squares.shape[1] == most < len(scene.points)
+    chosen = most_shown(len(scene.points), scene.seen, scene.train, most)
     assert shown[chosen].min() >= np.delete(shown, chosen).max()
     logs = np.random.default_rng(1).normal(0, 0.3, (len(scene.train), 3))
     logs -= logs.mean(0)
