@@ -46,8 +46,7 @@ MOST: dict[str, float] = {
 }  # beyond, no lens and no sensor does so
 SURE = 3
 # Standard errors from which a short run, which differs by more than vignetting gains, is not asked. What was
-# put on three captures, 0.3 and above, is told by 7 to 50; what a street's changing light feigns by 4 to 5;
-# what a walk feigns, on which points near the rim are nearer, by 0.8 with depths told apart, else by 9.
+# put on three captures, 0.3 and above, is told by 7 to 50; what a street's light feigns by 5, a walk's by 1.
 CERTAIN = 6
 DEVICE_PHOTOS, DEVICES_MOST = 4, 16  # that a camera must have taken; cameras that are told apart
 ROWS = 12_000  # colours of points in photos that are looked at
@@ -259,10 +258,11 @@ def device_signs(views: Sequence[View], shared: SharedColors) -> DeviceSigns | N
     if not count:
         return None
     table = _Table.of(shared, of_photo)
-    lens = nearer = Fit(np.zeros((count, 2)), np.zeros((count, 2, 2)))
+    lens, straight = Fit(np.zeros((count, 2)), np.zeros((count, 2, 2))), table.logs
     sensors = [lens] * 3  # of red, green and blue
     for _ in range(BENT if count > 1 else 1):
-        lens, nearer, sensors = table.cameras(lens, sensors)
+        lens, straight, sensors = table.cameras(sensors)
+    nearer = table.fit(straight.mean(1), table.radii, HOLDS_LENS, [table.depths])  # light may go by depth
     darker = min(map(_corners, (lens, nearer)), key=lambda sign: sign.size - SURE * sign.error)
     bent = _surest([sign for sensor in sensors for sign in _bends(sensor)]) if count > 1 else None
     response = as_responses(np.stack([sensor.found for sensor in sensors], 2))
@@ -317,7 +317,7 @@ class _Table:
     point: Numbers  # [M]
     device: Numbers  # [M]
     logs: Floats  # [M, 3]
-    squares: Floats  # [M]
+    radii: Floats  # [M, 2], -r^2 and -r^4
     depths: Floats  # [M]
 
     @staticmethod
@@ -327,8 +327,10 @@ class _Table:
         most = max(ROWS * len(points) // max(int(told[:, points].sum()), 1), 1)
         points = points[evenly(len(points), most)]
         photo, point = np.nonzero(told[:, points])
-        of, parts = (photo, points[point]), (shared.logs, shared.squares, shared.depths)
-        return _Table(of_photo, photo, point, of_photo[photo], *(part[of] for part in parts))
+        at = photo, points[point]
+        squares = shared.squares[at]
+        radii = -np.stack([squares, squares**2], 1)
+        return _Table(of_photo, photo, point, of_photo[photo], shared.logs[at], radii, shared.depths[at])
 
     def means(self, logs: Floats) -> tuple[Floats, Floats]:
         """A colour of each point [P, 3] and a level of each photo [N, 3] whose sums are these rows' best."""
@@ -338,20 +340,18 @@ class _Table:
             level = _mean(logs - colors[self.point], self.photo, len(level))
         return colors, level
 
-    def cameras(self, lens: Fit, sensors: Sequence[Fit]) -> tuple[Fit, Fit, list[Fit]]:
-        """What lenses (k1, k2) and sensors (a, b; of mean 0 over photos) do, told from first guesses; lenses
-        also if a point's light may change by a power of its depth."""
+    def cameras(self, sensors: Sequence[Fit]) -> tuple[Fit, Floats, list[Fit]]:
+        """What lenses (k1, k2) do, the logarithms of light that tell it, and what sensors (a, b; of mean 0
+        over photos) do, told from first guesses."""
         taken = self.device >= 0
         response = np.stack([sensor.found for sensor in sensors], 2)
         own = np.where(taken[:, None, None], response[self.device], 0)
         straight = straightened(self.logs, own)
-        radii = -np.stack([self.squares, self.squares**2], 1)
-        lens = self.fit(straight.mean(1), radii, HOLDS_LENS)
-        nearer = self.fit(straight.mean(1), radii, HOLDS_LENS, [self.depths])
-        fall = np.where(taken, (radii * as_a_lens(lens.found)[self.device]).sum(1), 0)[:, None]
+        lens = self.fit(straight.mean(1), self.radii, HOLDS_LENS)
+        fall = np.where(taken, (self.radii * as_a_lens(lens.found)[self.device]).sum(1), 0)[:, None]
         counts = np.bincount(self.of_photo[self.of_photo >= 0])
         if len(counts) == 1:
-            return lens, nearer, [*sensors]
+            return lens, straight, [*sensors]
         # at what the other photos let expect: a photo's own noise would be taken for a response
         colors, level = self.means(straight - fall)
         value = to_srgb(np.exp(colors[self.point] + level[self.photo] + fall))
@@ -360,7 +360,7 @@ class _Table:
         logs = straight - fall + (basis * own).sum(1)
         fits = [self.fit(logs[:, c], basis[..., c], (HOLDS_RESPONSE,) * 2) for c in range(3)]
         sensors = [fit._replace(found=fit.found - counts @ fit.found / counts.sum()) for fit in fits]
-        return lens, nearer, sensors
+        return lens, straight, sensors
 
     def fit(self, logs: Floats, basis: Floats, holds: Sequence[float], beside: Sequence[Floats] = ()) -> Fit:
         """What each camera adds to `logs` [M], by parameters of `basis` [M, K].

@@ -148,7 +148,7 @@ def _factors(scene: Scene, seed: int) -> dict[str, float]:
     places = dict(zip(names, rng.random(len(names)), strict=True))
     factors = dict(zip(names, rng.uniform(0.5, 1.5, len(names)).tolist(), strict=True))
     train = sorted((view.name for view in scene.train), key=lambda name: places[name])
-    return {name: factors[name] for name in train[: -(-len(train) // 2)]}
+    return {name: factors[name] for name in train[: (len(train) + 1) // 2]}
 
 
 def _note(scene: Scene, degradation: Degradation, seed: int, stored: str) -> str:
@@ -159,7 +159,7 @@ def _note(scene: Scene, degradation: Degradation, seed: int, stored: str) -> str
         kind += f" ({', '.join(f'{steps} at a width of {width} px' for steps, width in exact.items())})"
     photos = f"all training photos ({len(scene.train)})"
     if degradation.partial:
-        hit = f"{-(-len(scene.train) // 2)} of {len(scene.train)}"
+        hit = f"{len(_factors(scene, seed))} of {len(scene.train)}"
         whole = all(step.some for step in degradation.steps)
         photos = f"{hit} training photos" if whole else f"{photos}, the steps of some: {hit}"
     return (
