@@ -152,7 +152,7 @@ def test_light_that_falls_off_with_depth_is_no_lens() -> None:
         signs, unaware = (device_signs(views, one) for one in (walk, replace(walk, depths=0 * depths)))
         assert signs is not None
         assert unaware is not None
-        assert unaware.vignetting.certain
+        assert unaware.vignetting.needed
         assert signs.vignetting.needed == (fall > 0)
         assert abs(signs.vignetting.size - fall) < 0.1
 
@@ -278,7 +278,7 @@ def test_what_no_camera_does_is_not_its_look() -> None:
     bright = [Look(np.ones(3), np.array([-1.14, 0.8]), np.zeros((2, 3))) for _ in views]
     signs = device_signs(views, colors(rng, bright, 0.05))
     assert signs is not None
-    assert signs.vignetting.size < -2 * LEAST["vignetting"]
+    assert signs.vignetting.size < -1.5 * LEAST["vignetting"]
     finding, other = device_findings(signs)
     assert not finding.needed
     assert "which no camera does" in finding.reason
@@ -348,12 +348,11 @@ def test_a_new_view_in_the_look_of_a_photo(tmp_path: Path, capsys: pytest.Captur
     assert main(["render", str(out), "--out", str(tmp_path / "x"), "--look", "view1"]) == 2
 
 
-@pytest.mark.parametrize(("size", "error", "found", "certain"), [
-    (0.3, 0.03, True, True), (0.5, 0.1, True, False), (0.3, 0.08, False, False), (9.0, 0.1, False, False),
-])  # fmt: skip
-def test_a_lens_that_is_not_told_surely_is_tried(
-    size: float, error: float, found: bool, certain: bool
-) -> None:
+@pytest.mark.parametrize(
+    ("size", "error", "found"),
+    [(0.3, 0.03, True), (0.18, 0.001, False), (0.4, 0.08, False), (9.0, 0.1, False)],
+)
+def test_a_lens_is_learned_that_light_does_not_feign(size: float, error: float, found: bool) -> None:
     sign = Sign("vignetting", size, error)
     finding, _ = device_findings(DeviceSigns(plain_devices([]), sign, None))
-    assert (finding.needed, finding.certain) == (found, certain)
+    assert finding.needed == found

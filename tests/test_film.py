@@ -376,13 +376,13 @@ def test_frames_of_a_coarse_film_differ_by_its_codec(monkeypatch: pytest.MonkeyP
 
 
 def test_a_coarse_film_trains_as_noisy_photos() -> None:
-    """Alone; where cameras are learned beside it, as photos without a fault."""
-    noisy, film, plain, both = (
+    """Alone or in the look of its lens; where cameras are learned beside it, as photos without a fault."""
+    noisy, film, dark, plain, both = (
         Trainer(tiny_scene(), tiny_config(method="hqgs", hqgs=replace(fixed(kind), held_pixels=False)))
-        for kind in (f"noise:{FILM_NOISE:g}", "video", "exposure", "video+exposure")
+        for kind in (f"noise:{FILM_NOISE:g}", "video", "vignetting+video", "exposure", "video+exposure")
     )
     assert replace(film.config, hqgs=noisy.config.hqgs) == noisy.config
-    assert film.config.densify != both.config.densify == plain.config.densify
+    assert dark.config.densify == film.config.densify != both.config.densify == plain.config.densify
     film.step()
     noisy.step()
     assert (film.gaussians.means == noisy.gaussians.means).all()

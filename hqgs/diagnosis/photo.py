@@ -169,7 +169,6 @@ class Finding:
     step: str | None = None  # in the grammar of `parse_formation`; None: nothing must be undone
     value: float | None = None  # median over photos: px, factor, levels or quality; None: not told
     spread: float | None = None  # robust standard deviation over photos; None: estimated from all together
-    certain: bool = False  # so surely told that no short run need try it
     needed: bool = field(init=False)
 
     def __post_init__(self) -> None:

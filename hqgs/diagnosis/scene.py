@@ -54,11 +54,6 @@ class Diagnosis:
         together = _correlation(self.photos)
         return together if together > SCENE_WHITE else None
 
-    @property
-    def certain(self) -> list[str]:
-        """The names of the parts that no short run need try."""
-        return [part.name for part in self.parts if part.certain]
-
     def needs(self) -> list[tuple[str, bool, str]]:
         """Per part: its name, whether the method needs it, and why, in one sentence."""
         return [(part.name, part.needed, part.reason) for part in self.parts]

@@ -45,7 +45,6 @@ LEARNED = tuple(name for name, kind in KINDS.items() if kind.own in ("photo", "c
 OWN = tuple(name for name, kind in KINDS.items() if kind.own)  # of each photo its own
 LINEAR = frozenset({"blur", "defocus", "motion", "lowres"})  # they take fine detail of all photos alike
 ERRORS = frozenset({"noise", "jpeg"})  # all photos show what is not there
-FILM = frozenset({"video"})  # the kinds of a film of which its codec alone is told
 NOT_MADE = {
     "focus": "focus depends on depths, which a photo does not show; defocus:R blurs the whole photo",
     **dict.fromkeys(DEVICES, "it belongs to a camera, and which camera took a photo is unknown"),
@@ -54,9 +53,14 @@ NOT_MADE = {
 }  # what a method can be told of only, and what to write for photos
 
 
+def film_alone(kinds: Set[str]) -> bool:
+    """Whether of a film its codec is told, and at most what a camera does to all photos."""
+    return kinds - set(DEVICES) == {"video"}
+
+
 def undegraded(kinds: Set[str]) -> bool:
     """Whether photos are as photographed, or each with what its own camera did; a film alone is not."""
-    return kinds <= set(OWN) and kinds != FILM
+    return kinds <= set(OWN) and not film_alone(kinds)
 
 
 def grammar() -> str:

@@ -54,9 +54,7 @@ class Prepared:
         self.diagnosis: Diagnosis | None = inspector.diagnose(scene) if asks_for_diagnosis(asked) else None
         settings = plan_run(facts, self.diagnosis, asked).settings
         if begin is not None and self.diagnosis is not None and asked.leave_out:
-            facts = replace(
-                facts, looks=tried_looks(scene, settings, self.diagnosis.certain, begin, inspector.on_stage)
-            )
+            facts = replace(facts, looks=tried_looks(scene, settings, begin, inspector.on_stage))
             settings = plan_run(facts, self.diagnosis, asked).settings
         self.facts: Facts = facts
         self.form(settings, inspector)

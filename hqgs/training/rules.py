@@ -20,11 +20,11 @@ from hqgs.diagnosis.scene import Diagnosis
 from hqgs.photos.formula import (
     DEVICES,
     ERRORS,
-    FILM,
     LEARNED,
     LINEAR,
     NONE,
     Degradation,
+    film_alone,
     parse_formation,
     undegraded,
 )
@@ -183,7 +183,7 @@ def loss(draft: Draft) -> None:
     elif "jpeg" in has:
         why = "a JPEG file only says in which rounding interval (cell) each DCT coefficient lies"
         draft.note(f"distance to the JPEG's cells + {settings.hqgs.jpeg_pixels:g} L1", why)
-    elif "noise" in has or has == FILM:
+    elif "noise" in has or film_alone(has):
         why = "squared error averages the noise away; L1 and D-SSIM would fit it"
         draft.note(f"squared error up to {KNEE:g} sigma of the noise, then L1", why)
     else:

@@ -6,10 +6,10 @@ are never looked at. Two kinds of parts are tried:
 - Growth. Where a photo is not yet shown as it is, growth adds Gaussians, whether or not other photos bear
   them out. Poses that are a little off, light that changes, mirrors and what a codec left ask for them
   without end: then they explain each photo alone, and views between photos are worse with every step.
-- What photos and cameras have of their own, where the diagnosis finds it: gains, vignetting, responses,
-  shake. Light that moves, a flash and reflections look like the first, and a scene shown without them
-  is then wrong all over. Of a photo held back one half is shown, which tells what its camera did; it is
-  measured on the other, as that camera takes the scene, brightness and tint set aside.
+- What photos and cameras have of their own, where the diagnosis finds it: gains, responses, shake. Light that
+  moves, a flash and reflections look like the first, and a scene shown without them is then wrong all over.
+  Of a photo held back one half is shown, which tells what its camera did; it is measured on the other, as
+  that camera takes the scene, brightness and tint set aside.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hqgs.base.evenly import evenly
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.evaluation.held_out import HeldOutViews
 from hqgs.evaluation.metrics import haarpsi, psnr_aligned, ssim
-from hqgs.photos.formula import NONE, parse_formation
+from hqgs.photos.formula import LEARNED, NONE, parse_formation
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import TrainConfig, with_iterations
@@ -45,8 +45,9 @@ class Looks(NamedTuple):
 
 # A photo's own shake is learned after 20 looks at it, and seen where it has a pixel: in copies of 120 px that
 # of the built-in room gains nothing, in 240 px 0.8 dB. Photos gain so differently that it takes many to tell.
-# Focus takes more looks than a short run has: there the diagnosis decides.
-LOOKS = (Looks(("exposure", "vignetting", "response"), 1000, 120, 200, 4), Looks(("shake",), 16, 240, 320, 2))
+# Focus takes more looks than a short run has, and vignetting, which a scene takes over, gains less than short
+# runs differ by: there the diagnosis decides.
+LOOKS = (Looks(("exposure", "response"), 1000, 120, 200, 4), Looks(("shake",), 16, 240, 320, 2))
 EACH, OFFSETS = 4, (1, 3)  # every so-manieth photo is held back, from these on, one after the other
 STEPS, SIDES = 400, (80, 320)  # of each short run; px of the copies, at least and at most
 SHARE = 0.05  # of the pixels that the run trains on: those of the trial of growth
@@ -112,13 +113,13 @@ def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = 
 
 
 def tried_looks(
-    scene: Scene, settings: TrainConfig, certain: Sequence[str], begin: Begin, on_stage: OnStage = silent
+    scene: Scene, settings: TrainConfig, begin: Begin, on_stage: OnStage = silent
 ) -> dict[str, Tried]:
     """What photos held back gain by each of the LOOKS of a formation, beside those before it that pay and
-    those that are `certain`."""
-    found, kept = dict[str, Tried](), [kind for kind in certain if kind in _kinds(settings)]
+    vignetting."""
+    found, kept = dict[str, Tried](), [kind for kind in ("vignetting",) if kind in _kinds(settings)]
     for group in LOOKS:
-        asked = [kind for kind in group.kinds if kind in _kinds(settings) and kind not in certain]
+        asked = [kind for kind in group.kinds if kind in _kinds(settings)]
         if not asked or len(scene.train) <= EACH or not len(scene.points):
             continue
         views = [shrunk(scene.train[k], group.side) for k in evenly(len(scene.train), group.photos)]
@@ -139,7 +140,7 @@ def tried_looks(
 
 def _with_looks(run: ShortRun, kinds: Sequence[str], held: Mapping[int, View], told: _Told) -> Values:
     """PSNR of the hidden halves, [V, 1], of a run that learns these kinds, as their own cameras took them."""
-    learned = [kind for group in LOOKS for kind in group.kinds if kind in kinds]
+    learned = [kind for kind in LEARNED if kind in kinds]
     hqgs = replace(run.plan.settings.hqgs, formation="+".join(learned) or NONE)
     run.begin(replace(run.plan, settings=replace(run.plan.settings, hqgs=hqgs)))
     told.steps(run)

@@ -17,7 +17,7 @@ from hqgs import _rust
 from hqgs.diagnosis.photo import undo_enlargement
 from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.formation import Operator, Separable, formation
-from hqgs.photos.formula import FILM, Degradation, parse_formation, small_side
+from hqgs.photos.formula import Degradation, film_alone, parse_formation, small_side
 from hqgs.photos.jpeg import Tables, tables_of_quality
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.scene import Scene, View
@@ -277,7 +277,7 @@ class Formation:
 
 def noise_of(degradation: Degradation) -> float:
     """Standard deviation of the photos' noise, where 1 is white; of a coarse film what its codec left."""
-    if {step.kind for step in degradation.steps} == FILM:
+    if film_alone({step.kind for step in degradation.steps}):
         return FILM_NOISE / 255
     return next((step.value or 0.0 for step in degradation.steps if step.kind == "noise"), 0.0) / 255
 

@@ -14,7 +14,7 @@ from hqgs.diagnosis.colors import plain_devices
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.shapes import enlarge
-from hqgs.photos.formula import DEVICES, FILM, LEARNED, undegraded
+from hqgs.photos.formula import DEVICES, LEARNED, film_alone, undegraded
 from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
@@ -73,7 +73,7 @@ class HQGS(Method[FormedTarget]):
         kinds = self.formation.kinds
         self.as_photographed: bool = not kinds
         # A film's photos share what its codec left, so that a scene learns it: it is nothing to expect.
-        self.noise: float = 0.0 if kinds == FILM else self.formation.noise
+        self.noise: float = 0.0 if film_alone(kinds) else self.formation.noise
         self._views = scene.train
         self._numbers = {view.name: k for k, view in enumerate(scene.train)}
         self._cameras: LearnedCameras | None = None
