@@ -27,6 +27,7 @@ from hqgs.scene.sfm import program
 from hqgs.scene.sfm import run as colmap_run
 from hqgs.scene.sfm.align import rotation_angles
 from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
+from hqgs.scene.sfm.database import join, known_cameras
 from hqgs.scene.sfm.failure import Outcome, what_to_take, why_few, why_lost
 from hqgs.scene.sfm.likely import likely_pairs
 from hqgs.scene.sfm.passes import PASSES, Attempt, Work, best_attempt
@@ -358,6 +359,27 @@ def test_all_photos_are_looked_at_again_only_where_a_few_lost_ones_gain_by_it(
     with pycolmap.Database.open(tried) as db:
         seen = [db.num_keypoints_for_image(k + 1) > 0 for k in range(len(photos) + 1)]
     assert 0 < sum(seen) <= 3  # it, and the two that it matches best
+
+
+def test_features_of_several_looks_lie_side_by_side(tmp_path: Path) -> None:
+    """The second photo has none in the first look."""
+    given = {"names": np.array(["a", "b"]), "sizes": np.full((2, 2), 9), "Ks": np.tile(np.eye(3), (2, 1, 1))}
+    paths = [tmp_path / f"{k}.db" for k in range(3)]
+    for path in paths:
+        known_cameras(given, path)
+    points = np.random.default_rng(0).random((2, 5, 6), np.float32)
+    rows = np.array([[0, 1], [3, 2]], np.uint32)
+    for path, features, count in zip(paths, points, (0, 4), strict=False):
+        with pycolmap.Database.open(path) as db:
+            db.write_keypoints(1, features)
+            if count:
+                db.write_keypoints(2, features[:count])
+                db.write_matches(1, 2, rows)
+    join(paths[:2], paths[2], 2)
+    with pycolmap.Database.open(paths[2]) as db:
+        np.testing.assert_array_equal(db.read_keypoints(1), points.reshape(10, 6))
+        np.testing.assert_array_equal(db.read_keypoints(2), points[1, :4])
+        np.testing.assert_array_equal(db.read_matches(1, 2), np.add(rows, [5, 0]))
 
 
 def test_where_photos_placed_one_after_the_other_find_no_place_all_are_placed_at_once(

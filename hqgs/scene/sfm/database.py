@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -136,3 +137,24 @@ def pipeline_options() -> pycolmap.IncrementalPipelineOptions:
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
     return options
+
+
+def join(databases: Sequence[Path], into: Path, photos: int) -> None:
+    """Write the features and matches of databases into one of the same photos, side by side.
+
+    Each is matched by itself: a feature that two of them show would pass for ambiguous.
+    """
+    found = [[np.zeros((0, 6), np.float32)] for _ in range(photos + 1)]  # by the photo's number, from 1 on
+    before, matches = np.zeros(photos + 1, np.int64), dict[int, list[NDArray[Any]]]()
+    for path in databases:
+        with pycolmap.Database.open(path) as db:
+            for pair, rows in zip(*db.read_all_matches(), strict=True):
+                matches.setdefault(pair, []).append(rows + before[[*pycolmap.pair_id_to_image_pair(pair)]])
+            for k in (k for k in range(1, photos + 1) if db.exists_keypoints(k)):
+                found[k].append(db.read_keypoints(k))
+                before[k] += len(found[k][-1])
+    with pycolmap.Database.open(into) as db:
+        for k in range(1, photos + 1):
+            db.write_keypoints(k, np.concatenate(found[k]))
+        for pair, rows in matches.items():
+            db.write_matches(*pycolmap.pair_id_to_image_pair(pair), np.concatenate(rows).astype(np.uint32))
