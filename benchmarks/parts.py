@@ -127,10 +127,11 @@ class Parts:
         return whole | {"on": on, "start": start} | what
 
     def placed_anew(self, cell: Cell) -> Scene:
-        """The scene with cameras that are found without the part. ValueError where photos are degraded."""
+        """The scene with cameras that are found without the part. ValueError where photos are degraded or few
+        of a capture, whose cameras are those of the whole."""
         keep = self.study.args.out / "scenes" / f"{cell.scene.name} without {cell.row.label}"
         longest = self.study.protocol.longest
-        if cell.degradation != NONE:
+        if cell.degradation != NONE or self.study.protocol.photos is not None:
             raise ValueError(f"{cell.row.label}: cameras are found anew in captures as they are")
         return load_scene(
             self.folders[cell.scene.name], downscale=cell.downscale, keep_sfm=keep, longest=longest
