@@ -117,9 +117,10 @@ def tried_looks(
 ) -> dict[str, Tried]:
     """What photos held back gain by each of the LOOKS of a formation, beside those before it that pay and
     vignetting."""
-    found, kept = dict[str, Tried](), [kind for kind in ("vignetting",) if kind in _kinds(settings)]
+    found, kinds = dict[str, Tried](), _kinds(settings)
+    kept = ["vignetting"] if "vignetting" in kinds else []
     for group in LOOKS:
-        asked = [kind for kind in group.kinds if kind in _kinds(settings)]
+        asked = [kind for kind in group.kinds if kind in kinds]
         if not asked or len(scene.train) <= EACH or not len(scene.points):
             continue
         views = [shrunk(scene.train[k], group.side) for k in evenly(len(scene.train), group.photos)]

@@ -131,8 +131,8 @@ class Work:
     def joined(self, one: Pass) -> Path:
         """The database of a pass that has the features and matches of several."""
         path, new = self.directory / f"{one.name}.db", self.directory / "joining.db"
-        more = [self.looked_at(each, self.names) for each in one.of[1:]]
         if not path.exists():
+            more = [self.looked_at(each, self.names) for each in one.of[1:]]
             new.unlink(missing_ok=True)
             join([self.database(one.of[0].name), *more], self.database(new.stem), len(self.names))
             new.rename(path)
