@@ -152,14 +152,14 @@ def test_a_scene_that_learns_the_noise_is_found_out(tmp_path: Path) -> None:
     grey = [replace(view, image=np.full_like(view.image, 128)) for view in clean.train]
     scene = degrade_scene(replace(clean, train=grey), parse_degradation("noise:50"), 0)
     fast = {"lr_sh0": 0.02, "lr_shN": 0.01, "lr_scales": 0.03, "lr_quats": 0.01, "lr_opacities": 0.2}
-    config = tiny_config(1_000, method="hqgs", hqgs=fixed("noise:50"), **fast)
+    config = tiny_config(2_000, method="hqgs", hqgs=fixed("noise:50"), **fast)
     trainer, constant = Trainer(scene, config), Trainer(scene, config)
     with patch.object(HQGS, "rate_left", 1.0):
         run_until(constant, config.iterations)
     run_until(trainer, config.iterations)
-    assert trainer.method.rate_left <= 1 / 4
+    assert trainer.method.rate_left <= 1 / 16
     errors = [error_of_grey(t, scene.train) for t in (trainer, constant)]
-    assert errors[0] < 0.98 * errors[1]
+    assert errors[0] < 0.92 * errors[1]
     run_to_end(trainer, tmp_path / "out")  # which only writes
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert any(note.startswith("the learning rates were lowered to 1/") for note in report["notes"])
