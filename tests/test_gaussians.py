@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny_scene import tiny_scene
 
 from hqgs.model.gaussians import Gaussians, mean_square_distance
-from hqgs.model.shapes import THINNEST, as_discs, enlarge
+from hqgs.model.shapes import THINNEST, as_discs
 from hqgs.scene.world import World
 from tests.reference import rotation_matrices
 
@@ -107,10 +106,10 @@ def test_what_is_no_tensor_stays_with_any_copy() -> None:
     made.errors = torch.arange(5.0)
     rows = torch.tensor([3, 1])
     turned = replace(made, quats=made.quats + 1)
-    copies = [turned, made.detached(), as_discs(made), enlarge(made, torch.ones(5)), made.rows(rows)]
+    copies = [turned, made.detached(), as_discs(made), made.rows(rows)]
     for copy in [*copies, made.like(made.rows(rows).named())]:
         assert (copy.world, copy.antialiased, copy.notes) == (World(unit=2.0), True, ["a note"])
-    assert torch.equal(copies[4].errors, torch.tensor([3.0, 1.0]))  # pyright: ignore
+    assert torch.equal(copies[3].errors, torch.tensor([3.0, 1.0]))  # pyright: ignore
     assert made.like(made.rows(rows).named()).errors is None
     assert [*made.named()] == ["means", "scales", "quats", "opacities", "sh0", "shN"]
 
@@ -161,30 +160,3 @@ def test_any_cloud_gives_finite_gaussians_of_unit_quaternions(count: int) -> Non
         assert all(tensor.is_contiguous() for tensor in discs.named().values())
         torch.testing.assert_close(discs.quats.norm(dim=1), torch.ones(count))
         torch.testing.assert_close(torch.linalg.det(axes(discs)), torch.ones(count).double())
-
-
-# --- The smallest Gaussian that photos show: its size, and the gradient of the trained size
-
-
-def test_variances_add_and_the_gradient_is_that_of_the_sum() -> None:
-    scene = tiny_scene()
-    gaussians = Gaussians.from_points(scene.points, scene.point_colors)
-    n, generator = len(gaussians), torch.Generator().manual_seed(0)
-    smallest = torch.rand(n, generator=generator).double()
-    scales = torch.randn(n, 3, generator=generator).double().requires_grad_()
-    gaussians.scales = scales
-    found = enlarge(gaussians, smallest)
-    variances = np.exp(2 * scales.detach().numpy()) + np.square(smallest.numpy())[:, None]
-    np.testing.assert_allclose(found.scales.detach().exp().square(), variances, rtol=1e-12)
-    assert found.opacities is gaussians.opacities
-    # d log sqrt(e^(2 s) + m^2) / ds by differences.
-    weights = torch.randn(n, 3, generator=generator).double()
-    (found.scales * weights).sum().backward()
-    step = 1e-6
-    sides = [
-        0.5 * np.log(np.exp(2 * (scales.detach().numpy() + h)) + np.square(smallest.numpy())[:, None])
-        for h in (step, -step)
-    ]
-    assert scales.grad is not None
-    expected = weights.numpy() * (sides[0] - sides[1]) / (2 * step)
-    np.testing.assert_allclose(scales.grad, expected, rtol=1e-6, atol=1e-9)

@@ -21,7 +21,6 @@ from tiny_scene import tiny_config, tiny_scene
 from hqgs.base.left_out import LeftOut
 from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.metrics import psnr
-from hqgs.model.gaussians import Gaussians
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.jpeg import tables_of_quality
 from hqgs.photos.pixels import as_floats
@@ -29,7 +28,6 @@ from hqgs.pipeline import train
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene
-from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig, HQGSConfig
 from hqgs.training.methods import MAKERS
 from hqgs.training.methods.hqgs import HQGS
@@ -308,8 +306,7 @@ def psnr_of(trainer: Trainer, photos: list, scene: Scene) -> float:
     return float(np.mean([value for value in values if value is not None]))
 
 
-def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hqgs.training.methods.hqgs.SIZES_REFRESH", 4)  # some between the stop and the end
+def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path) -> None:
     config = tiny_config(20, method="hqgs", hqgs=fixed("blur:1+noise:9"))
     assert_stopped_alike(lambda: Trainer(tiny_scene(), config), tmp_path, 11)
 
@@ -327,36 +324,6 @@ def test_photo_pixels_are_those_of_the_nearest_view_that_sees_the_mean() -> None
     assert behind == pytest.approx(2 / 20)  # behind the first, 2 units before the second
     nowhere = photo_pixels(torch.tensor([[1e6, 0.0, 3.0]]), views)
     assert nowhere.tolist() == [0.0]
-
-
-def test_no_gaussian_is_smaller_than_its_floor() -> None:
-    scene = tiny_scene()
-    method = HQGS(scene, fixed("lowres:2", smallest=0.5))
-    gaussians = method.start(Gaussians.from_points(scene.points, scene.point_colors, 3), 30)
-    with torch.no_grad():
-        gaussians.scales[0] = -20.0
-        gaussians.scales[1] = 3.0
-    scales = method.modulate(gaussians).activated_scales()
-    floor = 0.5 * 2 * photo_pixels(gaussians.means, scene.train)  # the photo's pixels are twice as large
-    assert torch.allclose(scales[0].double(), floor[0].expand(3), rtol=1e-5)
-    assert torch.allclose(scales[1], torch.exp(torch.tensor(3.0)).expand(3), rtol=1e-4)
-
-
-def test_sizes_follow_a_change_of_rows_that_keeps_their_number() -> None:
-    trainer = Trainer(tiny_scene(), tiny_config(method="hqgs", hqgs=fixed("noise:9")))
-    trainer.step()
-    method = trainer.method
-    assert isinstance(method, HQGS)
-    before = method.state_dict()["smallest"]
-    n = len(trainer.gaussians)
-    turned = torch.arange(n - 1, -1, -1)
-    select_rows(trainer.gaussians, trainer.state.optimizer, turned, old=n)
-    trainer.state.iteration = 7
-    method.rows_changed(trainer.state, turned)
-    expected = method.config.smallest * photo_pixels(trainer.gaussians.means, trainer.scene.train)
-    assert torch.equal(method.state_dict()["smallest"], expected.float())
-    assert not torch.equal(method.state_dict()["smallest"], before)
-    assert int(method.state_dict()["since"]) == 7
 
 
 def test_the_trainer_tells_the_method_of_growth_and_culling() -> None:

@@ -1,17 +1,13 @@
-"""Shapes of Gaussians: discs as dense neighbours lie, and none smaller than what photos can show."""
+"""Shapes of first Gaussians: discs as dense neighbours lie."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial import KDTree
-from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from hqgs.base.elementary import exp, log
 from hqgs.model.formats.turned import quaternions
 from hqgs.model.gaussians import Gaussians
 
@@ -41,31 +37,3 @@ def as_discs(gaussians: Gaussians) -> Gaussians:
         scales=gaussians.scales + torch.from_numpy(np.log(shape)).float(),
         quats=torch.from_numpy(quats).float(),
     )
-
-
-def enlarge(gaussians: Gaussians, smallest: Tensor) -> Gaussians:
-    """The Gaussians convolved with round ones of standard deviation `smallest` [N], world units.
-
-    Mip-Splatting's 3D smoothing without its change of the opacities: they are trained with it.
-    """
-    scales = _Enlarge.apply(gaussians.scales, smallest)
-    return gaussians.like(gaussians.named() | {"scales": scales})
-
-
-class _Enlarge(torch.autograd.Function):
-    """log sqrt(exp(2 scale) + smallest^2). In place where it can be: each step does it for all Gaussians."""
-
-    @staticmethod
-    def forward(ctx: Any, scales: Tensor, smallest: Tensor) -> Tensor:
-        own = exp(2 * scales)  # variances
-        variances = own + smallest.square()[:, None]
-        ctx.save_for_backward(own.div_(variances))
-        return log(variances).mul_(0.5)
-
-    @staticmethod
-    @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's own is too general)
-        ctx: Any, v_scales: Tensor
-    ) -> tuple[Tensor, None]:
-        (share,) = ctx.saved_tensors
-        return v_scales * share, None

@@ -140,7 +140,6 @@ class HQGSConfig:
     guidance: str = FORMATION  # or "paper": `PaperHQGS` instead of everything below
     formation: str = AUTO  # what happened to the photos, as `parse_formation` reads it; "auto": diagnosed
     jpeg_pixels: float = 0.2  # weight of the pixel loss beside the loss of the JPEG cells
-    smallest: float = 0.5  # standard deviation of the smallest Gaussian, in photo pixels
     gaussians_per_pixel: float = 1 / 3  # for each pixel's worth of degraded photos: the most that may grow
     held_pixels: bool = True  # under noise: hold some back, which tell when it is learned (`HeldPixels`)
     first_points: float = 1.0  # share of that number to start from, filled up along edges; 0: no filling up
@@ -150,7 +149,7 @@ class HQGSConfig:
             raise ValueError(f"guidance is {self.guidance!r}, wanted one of: {', '.join(GUIDANCES)}")
         if self.formation != AUTO:
             parse_formation(self.formation)
-        _at_least(self, 0, "jpeg_pixels", "smallest", "gaussians_per_pixel")
+        _at_least(self, 0, "jpeg_pixels", "gaussians_per_pixel")
         if not 0 <= self.first_points <= 1:
             raise ValueError(f"first_points is {self.first_points}, wanted 0 to 1")
 

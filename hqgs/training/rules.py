@@ -228,8 +228,6 @@ def budget(draft: Draft) -> None:
         why = "lower, as the loss has no gradient within a rounding interval of the JPEG"
         draft.note(f"gradient of {threshold:.2g}", why, what="densification threshold")
     draft.grow(max_gaussians=most, grad_threshold=threshold)
-    if size := settings.hqgs.smallest:
-        draft.note(f"{size:g} px of a photo", "no photo shows finer detail", what="smallest Gaussian")
 
 
 def bound_of_few(draft: Draft) -> int:
@@ -501,7 +499,7 @@ OF_PHOTOS_ALONE = (  # they need no poses
 RULES = (
     Rule("a photo", unused_photos, "a broken or empty photo would add wrong colours"),
     *OF_PHOTOS_ALONE,
-    Rule("budget", budget, "Candes and Donoho 2004; Mip-Splatting, Yu et al. 2024; " + CHOSEN),
+    Rule("budget", budget, "Candes and Donoho 2004; " + CHOSEN),
     Rule("first points", first_points, f"one for each {PIXELS} pixels, or the budget: {CHOSEN}"),
     Rule("length", length, f"{FOR_EACH_PHOTO} for each photo, {LEAST_ENOUGH:,} at least: {CHOSEN}"),
     Rule("photos' size", half_size, CHOSEN),

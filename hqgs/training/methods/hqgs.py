@@ -13,10 +13,8 @@ from torch import Tensor
 from hqgs.diagnosis.colors import plain_devices
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.shapes import enlarge
-from hqgs.photos.formula import DEVICES, LEARNED, film_alone, undegraded
+from hqgs.photos.formula import DEVICES, LEARNED, film_alone
 from hqgs.photos.pixels import floats
-from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import HQGSConfig
@@ -30,7 +28,6 @@ from hqgs.training.state import TrainState
 # Standard deviations of the noise up to which differences count by their square (Huber): half as steep there
 # as L1 on average, and growth goes by the gradient, hence STEEPER.
 KNEE, STEEPER = 2.0, 2.0
-SIZES_REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
 class HQGS(Method[FormedTarget]):
@@ -51,7 +48,6 @@ class HQGS(Method[FormedTarget]):
     - None of them: the loss of 3DGS, and the start below.
     - A coarse film's codec (video) and nothing else: as noise of FILM_NOISE levels, without held pixels.
     - Short runs have higher rates than 3DGS (`learning_rates`), but for those of JPEG alone.
-    - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (`budget` in rules.py).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
       more: pixels along the photos' edges, at depths that other photos agree on (`points_along_edges`).
@@ -90,8 +86,6 @@ class HQGS(Method[FormedTarget]):
             self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed, devices)
         holds = self.noise and config.held_pixels and "jpeg" not in kinds
         self._plateau = Plateau(len(scene.train)) if holds else None
-        self._smallest: Tensor | None = None  # [N] world units; None: there is no limit
-        self._since = 0  # the iteration after which they were computed
 
     @property
     def rate_left(self) -> float:
@@ -120,12 +114,7 @@ class HQGS(Method[FormedTarget]):
     def start(self, gaussians: Gaussians, iterations: int) -> Gaussians:
         if self._cameras is not None:
             self._cameras.schedule(iterations)
-        if not undegraded(self.formation.kinds):
-            self._measure(gaussians, 0)
         return gaussians
-
-    def modulate(self, gaussians: Gaussians) -> Gaussians:
-        return gaussians if self._smallest is None else enlarge(gaussians, self._smallest)
 
     def shot(self, view: View, target: FormedTarget) -> Shot:
         return no_shot(view) if self._cameras is None else self._cameras.shot(view, target.photo)
@@ -144,22 +133,16 @@ class HQGS(Method[FormedTarget]):
             image = torch.where(mask[..., None], image, floats(photo))
         return target.cells.loss(image, target.centres) + self.config.jpeg_pixels * pixels
 
-    def rows_changed(self, state: TrainState, parents: Tensor) -> None:
-        if self._smallest is not None:
-            self._measure(state.gaussians, state.iteration)
-
     def measured(self, image: Tensor, target: FormedTarget) -> Tensor:
         """The error at the held pixels, if there are any."""
         return super().measured(image, target) if target.held is None else target.held.error(image)[None]
 
     def after_step(self, state: TrainState, view: View, seen: Tensor) -> None:
-        """The smallest sizes and the cameras' depths age, and the held pixels decide on the rates."""
-        if self._smallest is not None and state.iteration - self._since >= SIZES_REFRESH:
-            self._measure(state.gaussians, state.iteration)
+        """The cameras' depths age, and the held pixels decide on the rates."""
         if self._plateau is not None and len(seen):
             self._plateau.see(self._numbers[view.name], seen[0])
         if self._cameras is not None:
-            self._cameras.after_step(state.iteration, view, self.modulate(state.gaussians))
+            self._cameras.after_step(state.iteration, view, state.gaussians)
 
     def learned(self) -> list[LearnedCamera]:
         return [] if self._cameras is None else self._cameras.learned()
@@ -174,22 +157,12 @@ class HQGS(Method[FormedTarget]):
         state = {}
         if self._plateau is not None:
             state = {f"held.{name}": tensor for name, tensor in self._plateau.state_dict().items()}
-        if self._smallest is not None:
-            state |= {"smallest": self._smallest, "since": torch.tensor(self._since)}
         if self._cameras is not None:
             state |= {f"camera.{name}": tensor for name, tensor in self._cameras.state_dict().items()}
         return state
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        if self._smallest is not None:
-            self._smallest, self._since = state["smallest"], int(state["since"])
         if self._plateau is not None:
             self._plateau.load_state_dict(part("held.", state))
         if self._cameras is not None:
             self._cameras.load_state_dict(part("camera.", state))
-
-    def _measure(self, gaussians: Gaussians, iteration: int) -> None:
-        """Half a pixel of the photos where each Gaussian is now."""
-        if self.config.smallest:
-            pixels = photo_pixels(gaussians.means, self._views) * self.formation.factor
-            self._smallest, self._since = (self.config.smallest * pixels).float(), iteration
