@@ -174,7 +174,7 @@ def test_a_share_out_of_range_is_refused() -> None:
         TrainConfig(dropout=-0.1)
 
 
-@pytest.mark.parametrize("left", [1.0, 2.0**-9])
+@pytest.mark.parametrize("left", [1.0, 2.0**-9, 2.0**-60])
 def test_a_step_decays_what_it_trains_once_for_each_view_as_the_rates_do(
     left: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -161,8 +161,9 @@ class Trainer:
             if self._sound([views.views[plan.view] for plan in plans], found):
                 found.apply()
                 # By rates that fell, a step gives less back: the same decay would make the whole scene fade.
-                if decay := views.method.rate_left * (config.opacity_decay or 0.0):
-                    decay_opacities(state.gaussians.opacities, 1 - (1 - decay) ** len(plans))
+                decay = views.method.rate_left * (config.opacity_decay or 0.0)
+                if share := 1 - (1 - decay) ** len(plans):  # 0, too, of a decay that rounding loses
+                    decay_opacities(state.gaussians.opacities, share)
             changed = last.densifies and self._densify(last)
             if fault := parameter_fault(state.gaussians, changed):
                 state.guard.note(state.iteration, found.step.view, fault)
