@@ -63,8 +63,8 @@ def test_steps_of_hqgs_stand_beside_those_of_3dgs(quick: DataFrame) -> None:
     # Of pairs of steps, and of medians: on a machine that others use they are not the same.
     assert all(0.2 < r["ratio"] / (r["seconds"] / rows[0]["seconds"]) < 5 for r in rows)
     assert {r["gaussians"] for r in rows} == {500}
-    first, second = (dict(pairs_of(row["stages"])) for row in rows[:2])
-    assert first["method"] < second["method"]  # no Gaussian is too small
+    first, last = (dict(pairs_of(rows[k]["stages"])) for k in (0, -1))
+    assert first["method"] < last["method"]  # the published form modulates Gaussians
 
 
 def test_speed_up_and_memory(quick: DataFrame) -> None:
