@@ -12,7 +12,6 @@ import numpy as np
 
 import hqgs
 from benchmarks.command import Benchmark
-from benchmarks.pages.figures import unbeaten
 from benchmarks.pages.sections import files, files_head
 from benchmarks.protocol import read_protocols, read_toml
 from benchmarks.rows import Table, facts
@@ -48,9 +47,8 @@ def measure(scene: Scene, gaussians: Gaussians, folder: Path) -> list[dict[str, 
         row |= {"gaussians": written.gaussians, "sh_degree": written.sh_degree, "bytes": written.bytes}
         row |= {"psnr": after, "cost_db": before - after, "psnr_to_original": psnr(a, b)}
         rows.append(row | {"largest_change": float(np.abs(a - b).max())})
-    best = unbeaten([(row["bytes"], -row["psnr"]) for row in rows])
     more = facts() | {"ply_bytes": rows[0]["bytes"] + NORMALS * len(gaussians)}
-    return [row | {"pareto": k in best} | more for k, row in enumerate(rows)]
+    return [row | more for row in rows]
 
 
 def run(args: argparse.Namespace) -> list[str]:

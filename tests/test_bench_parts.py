@@ -16,7 +16,6 @@ import hqgs
 from benchmarks import cli, everything, protocol
 from benchmarks import export as bench
 from benchmarks.everything import command_of, publish
-from benchmarks.pages.figures import unbeaten
 from benchmarks.pages.write import STUDIES
 from benchmarks.parts import ALL, PARTS, alone, gains_of, length, lines_of, parts_table
 from benchmarks.rows import RUN, Table, pairs_of
@@ -227,18 +226,11 @@ def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     for row in files.values():
         assert row["psnr"] == pytest.approx(exact["psnr"] - row["cost_db"], abs=1e-3)
         assert 0 <= row["largest_change"] < 0.2
-    points = [(row["bytes"], -row["psnr"]) for row in files.values()]
-    assert {k for k, row in enumerate(files.values()) if row["pareto"]} == set(unbeaten(points))
 
     text = capsys.readouterr().out
     assert all(f"| {name} |" in text for name in files)
     assert text.startswith("Embedded, 24 x 16 px, ")
     assert not list(tmp_path.glob("tmp*"))
-
-
-def test_the_front_holds_what_no_other_beats_in_both() -> None:
-    pairs = [(10, 30.0), (5, 29.0), (5, 28.0), (7, 28.5), (1, 20.0), (1, 20.0), (12, 30.0)]
-    assert unbeaten([(size, -psnr) for size, psnr in pairs]) == [4, 5, 1, 0]
 
 
 # --- The benchmark `time`: runs that have seconds, and one that keeps its course

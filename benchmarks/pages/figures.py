@@ -215,14 +215,3 @@ def beside(
         worst = format(whole.worst, "+.2f") if whole.count else NOTHING
         body.append([words.get(label, str(label)), *means, *cells, whole.text(), worst])
     return table(["", f"`{base}`", f"`{row}`", *scenes, "gain", "worst run"], body)
-
-
-def unbeaten(points: Sequence[tuple[float, float]]) -> list[int]:
-    """The indices of the points that no other one beats, with less of one and no more of the other: a Pareto
-    front by rising first coordinate."""
-
-    def beats(a: tuple[float, float], b: tuple[float, float]) -> bool:
-        return a != b and a[0] <= b[0] and a[1] <= b[1]
-
-    order = sorted(range(len(points)), key=lambda k: points[k])
-    return [k for k in order if not any(beats(other, points[k]) for other in points)]

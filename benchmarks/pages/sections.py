@@ -172,13 +172,12 @@ def levels(times: DataFrame, scenes: Sequence[str], base: str = BASE) -> str:
 
 
 def files(export: DataFrame) -> str:
-    """Size of each file and what it costs in held-out PSNR."""
+    """Size of each file and what it costs in held-out PSNR, the largest first."""
     body = []
-    for line in records(export):
+    for line in records(export.sort_values("bytes", ascending=False, kind="stable")):
         sizes = f"{line['bytes'] / 1e6:.2f}", f"{line['bytes'] / line['ply_bytes']:.1%}"
-        pareto = "yes" if line["pareto"] else ""
-        body.append([line["file"], *sizes, f"{0.0 - line['cost_db']:+.3f}", pareto])
-    return table(["file", "MB", "of 3DGS's PLY", "PSNR (dB)", "Pareto"], body)
+        body.append([line["file"], *sizes, f"{0.0 - line['cost_db']:+.3f}"])
+    return table(["file", "MB", "of 3DGS's PLY", "PSNR (dB)"], body)
 
 
 def files_head(export: DataFrame) -> str:
