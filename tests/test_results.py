@@ -148,7 +148,9 @@ def test_where_runs_are_from_is_said_once() -> None:
     one = frame(run_of("3dgs", 20.0))
     assert made(one) == "1 lines; commit abc; CPU; 2026-11-26."
     two = made(one, frame(run_of("hqgs", 20.0, commit="def", date="2026-11-25")))
-    assert two.startswith("2 lines; commits def, abc; CPU; 2026-11-25 to 2026-11-26. Not of one commit")
+    assert two.startswith("2 lines; commits def, abc; CPU; 2026-11-25 to 2026-11-26. Not of one code")
+    same = made(one.assign(sources="1"), one.assign(sources="1", commit="def"))
+    assert same == "2 lines; commits abc, def; CPU; 2026-11-26."  # whose sources are the same
     assert made(one.iloc[:0]) == "Not measured yet."
 
 

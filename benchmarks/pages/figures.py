@@ -172,18 +172,17 @@ def and_list(words: Sequence[str]) -> str:
 
 def made(*frames: DataFrame) -> str:
     """Where the runs of a page are from: number, commits, machines, dates."""
-    parts = [frame[["commit", "machine", "date"]] for frame in frames if len(frame)]
+    columns = ["commit", "machine", "date", "sources"]
+    parts = [frame.reindex(columns=columns) for frame in frames if len(frame)]
     if not parts:
         return "Not measured yet."
-    runs = pd.concat(parts, ignore_index=True)
-    known = {(day, commit) for day, commit in zip(runs["date"], runs["commit"], strict=True) if commit}
-    commits = list(dict.fromkeys(commit for _, commit in sorted(known)))
-    dates = sorted({date for date in runs["date"] if date})
+    runs = pd.concat(parts, ignore_index=True).sort_values(["date", "commit"], kind="stable")
+    commits, machines, dates = (list(dict.fromkeys(filter(None, runs[name]))) for name in columns[:3])
     when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
-    machines = and_list(sorted({machine for machine in runs["machine"] if machine}))
-    text = f"{len(runs)} lines; commit{'s' * (len(commits) > 1)} {', '.join(commits)}; {machines}; {when}."
-    mixed = " Not of one commit and machine: cells compare roughly."
-    return text + (mixed if len(commits) > 1 else "")
+    text = f"{len(runs)} lines; commit{'s' * (len(commits) > 1)} {', '.join(commits)}; "
+    text += f"{and_list(sorted(machines))}; {when}."
+    same = len(commits) == 1 or runs["sources"].fillna(runs["commit"]).nunique() == 1
+    return text + ("" if same else " Not of one code and machine: cells compare roughly.")
 
 
 def weakest(frame: DataFrame, row: str = "hqgs", base: str = "3dgs") -> str:
