@@ -64,7 +64,7 @@ def with_up(scene: Scene) -> Scene:
     if found is None:
         note = "up is as the photos were held, as upright edges or GPS are not clear enough"
         return replace(scene, notes=[*scene.notes, note])
-    moved = math.degrees(math.acos(min(float(found.direction @ before), 1.0)))
+    moved = math.degrees(math.acos(float(np.clip(found.direction @ before, -1, 1))))
     why = (
         f"by {found.said}: 95 % of it within {found.error:.2g} degrees, "
         f"and {moved:.2g} degrees from how the photos were held"
