@@ -17,6 +17,7 @@ from PIL import Image
 from test_covariances import covariances as of_axes
 from test_formats import change_gltf, random_gaussians
 
+from hqgs.model.formats import gltf
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.paths import look_at
 from hqgs.scene.scene import Camera
@@ -143,7 +144,7 @@ def colours(g: Gaussians, k: int, direction: np.ndarray) -> np.ndarray:
     return image[image.shape[0] // 2, image.shape[1] // 2].numpy()
 
 
-def test_several_primitives_and_nodes_are_joined(tmp_path: Path) -> None:
+def test_several_primitives_and_nodes_are_joined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     g = random_gaussians(6, 1)
     g.save(tmp_path / "a.glb")
 
@@ -162,6 +163,10 @@ def test_several_primitives_and_nodes_are_joined(tmp_path: Path) -> None:
     torch.testing.assert_close(read.means[18:, 0], g.means[:, 0] + 10)
     assert read.shN[:6].any()
     assert not read.shN[6:12].any()
+    change_gltf(tmp_path / "a.glb", lambda content: nodes(content, 40 * [{}]))
+    monkeypatch.setattr(gltf, "MAX_GAUSSIANS", 20)
+    with pytest.raises(ValueError, match="meshes again, more than 20 Gaussians in all"):
+        Gaussians.load(tmp_path / "a.glb")
 
 
 @pytest.mark.parametrize("embedded", [True, False])
@@ -269,6 +274,12 @@ def test_sog(tmp_path: Path, packed: bool, bands: int) -> None:
     if bands:
         wanted = g.shN[:, : (bands + 1) ** 2 - 1].clamp(-4, 4)
         np.testing.assert_allclose(read.shN, wanted, atol=0.017)
+    meta = json.loads(files["meta.json"]) | {"count": 10**6}
+    with zipfile.ZipFile(tmp_path / "many.sog", "w") as out:
+        for name, content in (files | {"meta.json": json.dumps(meta).encode()}).items():
+            out.writestr(name, content)
+    with pytest.raises(ValueError, match=r"1000000 Gaussians, in \d+ bytes"):
+        Gaussians.load(tmp_path / "many.sog")
     broken = tmp_path / "broken.sog"
     broken.write_bytes(b"PK\3\4nothing")
     with pytest.raises(ValueError, match=r"broken\.sog: not a readable SOG scene"):
@@ -323,6 +334,8 @@ def test_ksplat(tmp_path: Path, level: int, degree: int) -> None:
     np.testing.assert_allclose(read.quats, quats, atol=2e-3)
     wanted = g.shN[:, : (degree + 1) ** 2 - 1]
     np.testing.assert_allclose(read.shN, wanted, atol=(1e-6, 4e-3, 0.02)[level])
-    (tmp_path / "a.ksplat").write_bytes(content[:-10])
-    with pytest.raises(ValueError, match="reaches beyond its end"):
-        Gaussians.load(tmp_path / "a.ksplat")
+    many = content[: 4096 + 32] + b"\xff" * 4 + content[4096 + 36 :]  # full buckets
+    for damaged in (content[:-10], *([many] if level else [])):
+        (tmp_path / "a.ksplat").write_bytes(damaged)
+        with pytest.raises(ValueError, match="reaches beyond its end"):
+            Gaussians.load(tmp_path / "a.ksplat")

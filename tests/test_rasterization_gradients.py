@@ -301,3 +301,30 @@ def test_covariances_have_no_logarithm() -> None:
     covars = torch.eye(3, dtype=F64).expand(3, 3, 3)
     with pytest.raises(ValueError, match="activate: not with covars"):
         hqgs.rasterization(**scene.arguments(covars=covars), activate=True)
+
+
+def test_a_graph_is_freed_by_its_backward_pass_as_torch_frees_its_own() -> None:
+    """Also of colours alone, where torch has no tensor to miss."""
+    scene = random_scene(60, 24, 17, seed=1, dtype=F64).with_grad("colors")
+    loss = hqgs.rasterization(**scene.arguments())[0].square().sum()
+    loss.backward(retain_graph=True)
+    once = scene.colors.grad.clone()  # pyright: ignore
+    loss.backward()
+    assert torch.equal(scene.colors.grad, 2 * once)  # pyright: ignore
+    with pytest.raises(RuntimeError, match="a second time"):
+        loss.backward()
+
+
+def test_backgrounds_may_change_before_the_backward_pass() -> None:
+    found = []
+    for later in (False, True):
+        scene, behind = (
+            random_scene(60, 24, 17, seed=1, dtype=F64).with_grad("opacities"),
+            torch.ones(1, 3, dtype=F64),
+        )
+        image = hqgs.rasterization(**scene.arguments(backgrounds=behind))[0]
+        if later:
+            behind.zero_()
+        image.square().sum().backward()
+        found.append(scene.opacities.grad)
+    assert torch.equal(*found)  # pyright: ignore

@@ -101,12 +101,20 @@ Gradients = tuple[Tensor | None, ...]
 
 
 def first_derivative(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:
-    """A backward pass that is an error to differentiate."""
+    """A backward pass that is an error to differentiate. Frees `ctx.state`, what Rust keeps, when torch frees
+    tensors, which are all that `save_for_backward` takes."""
 
     @wraps(backward)
     def once(ctx: Any, *grads):
+        if getattr(ctx, "state", ctx) is None:
+            raise RuntimeError(
+                "Trying to backward through the graph of hqgs.rasterization a second time, when what it kept "
+                "is freed: say backward(retain_graph=True) the first time"
+            )
         with one_torch_thread(), torch.no_grad():
             found = backward(ctx, *grads)
+        if not torch._C._autograd._get_current_graph_task_keep_graph():  # pyright: ignore[reportAttributeAccessIssue]
+            ctx.state = None
         if not torch.is_grad_enabled():  # it is where create_graph is
             return found
         return _First.apply(*(None if grad is None else grad.requires_grad_() for grad in found))
@@ -134,7 +142,7 @@ class _Project(torch.autograd.Function):
             *inputs, _optional(rest), poses, intrinsics, width, height, *others
         )
         n, c = means.shape[0], viewmats.shape[0]
-        ctx.frame, ctx.shapes, ctx.has_harmonics = frame, (n, c), sh_degree is not None
+        ctx.state, ctx.shapes, ctx.has_harmonics = frame, (n, c), sh_degree is not None
         ctx.sh_shapes = [() if t is None else tuple(t.shape) for t in (colors, rest)]
         ctx.save_for_backward(means, quats, scales, opacities)
         ctx.set_materialize_grads(False)
@@ -162,7 +170,7 @@ class _Project(torch.autograd.Function):
             v_colors = None
         cotangents = v_means2d, v_link, v_alphas, v_depths, v_conics, v_colors
         inputs = as_array(means), as_array(quats), as_array(scales), as_array(opacities)
-        v_inputs = [*_rust.project_backward(ctx.frame, inputs, tuple(map(_optional, cotangents)), needs)]
+        v_inputs = [*_rust.project_backward(ctx.state, inputs, tuple(map(_optional, cotangents)), needs)]
         if v_inputs[7] is not None:  # computed in f64; stay finite in the dtype of the inputs
             limit = torch.finfo(means.dtype).max
             v_inputs[7].clip(-limit, limit, out=v_inputs[7])
@@ -182,7 +190,7 @@ class _Composite(torch.autograd.Function):
         ctx: Any, frame, means2d, packed, link, alphas_in, colors, depths, backgrounds, mode, absgrad, which
     ):
         c, n = link.shape[:2]
-        channels, behind = as_array(colors), _optional(backgrounds)
+        channels, behind = as_array(colors), None if backgrounds is None else as_array(backgrounds).copy()
         if mode != "RGB":
             last = as_array(depths)[..., None]
             channels = (
@@ -193,12 +201,12 @@ class _Composite(torch.autograd.Function):
         state, image, alphas = _rust.composite_forward(frame, channels, behind, channels.shape[-1])
         image = image.reshape(c, frame.height, frame.width, channels.shape[-1])
         alphas = alphas.reshape(c, frame.height, frame.width, 1)
-        ctx.expected = None  # depth, with the alphas
+        expected = None  # depth, with the alphas
         if mode.endswith("ED"):
             with np.errstate(all="ignore"):
                 image[..., -1:] /= np.maximum(alphas, LEAST_ALPHA)
-            ctx.expected = image[..., -1:].copy(), alphas.copy()
-        ctx.state, ctx.behind, ctx.mode, ctx.absgrad, ctx.which = state, behind, mode, absgrad, which
+            expected = image[..., -1:].copy(), alphas.copy()
+        ctx.state, ctx.mode, ctx.absgrad, ctx.which = (state, behind, expected), mode, absgrad, which
         ctx.shape = c, n, channels.shape[-1]
         if absgrad:
             ctx.save_for_backward(means2d if packed is None else packed)
@@ -215,15 +223,15 @@ class _Composite(torch.autograd.Function):
         geometry = need_means2d or need_link or need_alphas
         if v_image is None and v_alphas is None:
             return (None,) * 11
-        c, n, channels = ctx.shape
+        (c, n, channels), (state, behind, expected) = ctx.shape, ctx.state
         v_image = np.zeros(ctx.image_shape, ctx.dtype) if v_image is None else as_array(v_image)
         v_alphas = _optional(v_alphas)
-        if ctx.expected is not None:
-            v_image, v_alphas = _of_accumulated(ctx.expected, v_image, v_alphas)
+        if expected is not None:
+            v_image, v_alphas = _of_accumulated(expected, v_image, v_alphas)
         need_colors, need_depths = need_colors and "RGB" in ctx.mode, need_depths and ctx.mode != "RGB"
-        need_backgrounds = need_backgrounds and ctx.behind is not None
+        need_backgrounds = need_backgrounds and behind is not None
         wanted = [geometry, ctx.absgrad, need_colors or need_depths, need_backgrounds]
-        v_inputs = _rust.composite_backward(ctx.state, ctx.behind, v_image, v_alphas, wanted)
+        v_inputs = _rust.composite_backward(state, behind, v_image, v_alphas, wanted)
         v_means2d, v_link, v_alphas_in, v_abs, v_colors, v_backgrounds = v_inputs
         v_means2d, v_packed = _tensor(v_means2d, c, n, 2), None
         v_abs = _tensor(v_abs, c, n, 2)

@@ -110,7 +110,7 @@ def rasterization(
         raise ValueError(f"rasterize_mode: must be one of {RASTERIZE_MODES}, got {rasterize_mode!r}")
     at_least_0 = {"eps2d": eps2d, "near_plane": near_plane, "radius_clip": radius_clip}
     check_numbers(width, height, tile_size, at_least_0)
-    if not far_plane > near_plane:
+    if not _number(far_plane) > near_plane:
         raise ValueError(f"far_plane: must be larger than near_plane {near_plane!r}, got {far_plane!r}")
     numbers = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
     config = (int(width), int(height), (*numbers, rasterize_mode == "antialiased"), activate, sh_degree)
@@ -360,7 +360,7 @@ def check_colors(colors: Tensor, rest: Tensor | None, n: int, c: int, sh_degree:
         if shape[:-1] not in ([n], [c, n]) or shape[-1] == 0:
             raise ValueError(f"colors: expected shape [{n}, D] or [{c}, {n}, D], got {shape}")
         return
-    if sh_degree not in (0, 1, 2, 3):
+    if sh_degree not in (0, 1, 2, 3) or isinstance(sh_degree, float):
         raise ValueError(f"sh_degree: must be 0, 1, 2 or 3, got {sh_degree!r}")
     needed = (sh_degree + 1) ** 2
     if rest is not None:

@@ -159,3 +159,9 @@ def scene_file(path: str | Path) -> Path:
             f"hqgs train PHOTOS --out {path} --resume continues it"
         )
     raise FileNotFoundError(f"there is no {file}: give the folder of a run, or a scene file")
+
+
+def bytes_of(file: Path) -> int:
+    """The size of a `scene_file`, with the pictures beside a meta.json."""
+    parts = file.parent.iterdir() if file.name == sog.META else [file]
+    return sum(part.stat().st_size for part in parts if part.is_file())

@@ -35,7 +35,7 @@ from hqgs.model.formats.arrays import (
     to_opacities,
     writable,
 )
-from hqgs.model.formats.spz import FLIP_MEANS, FLIP_QUATS, FLIP_SH
+from hqgs.model.formats.spz import FLIP_MEANS, FLIP_QUATS, FLIP_SH, MAX_GAUSSIANS
 from hqgs.model.formats.turned import matrices, near_origin, placed, recolored
 from hqgs.photos.light import to_srgb
 from hqgs.scene.world import World
@@ -142,11 +142,16 @@ def read_gltf(path: Path) -> Arrays:
     said = extras.get("hqgs_world") if isinstance(extras, dict) else None
     world = World() if said is None else World.of_json(said)
     notes, parts, maps = list[str](), list[Arrays](), list[Array]()
+    left = max(MAX_GAUSSIANS, sum(map(len, buffers)) // 10)  # a stored one takes more than ten bytes
     for number, matrix in _placed_meshes(content):
         for primitive in content["meshes"][number]["primitives"]:
             if NAME in primitive.get("extensions", {}):
                 parts.append(_gaussians(content, buffers, primitive, notes))
                 maps.append(_in_frame(matrix, world))
+                if (left := left - len(parts[-1]["means"])) < 0:
+                    raise ValueError(
+                        f"its nodes show meshes again, more than {MAX_GAUSSIANS:,} Gaussians in all"
+                    )
     if not parts:
         raise ValueError(f"no primitive with {NAME}")
     still = all(np.array_equal(by, np.eye(4)) for by in maps)

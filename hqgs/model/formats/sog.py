@@ -181,14 +181,20 @@ def read_sog(path: Path) -> Arrays:
 def _read(file: Callable[[str], bytes]) -> Arrays:
     meta = json.loads(file(META))
     count = int(meta["count"] if "count" in meta else meta["means"]["shape"][0])
-    if not 0 < count <= 50_000_000:
-        raise ValueError(f"{count} Gaussians")
 
-    def pixels(part: dict[str, Any], number: int = 0, rows: int | None = count) -> Bytes:
+    def packed(part: dict[str, Any], number: int) -> bytes:
         name = part["files"][number]
         if Path(name).name != name or name.startswith("."):
             raise ValueError(f"the picture {name!r} is outside of its folder")
-        with Image.open(io.BytesIO(file(name))) as picture:
+        return file(name)
+
+    size = len(packed(meta["means"], 0))  # of positions' low bytes, which hardly pack
+    if not 0 < count <= min(50_000_000, 100 * size):
+        raise ValueError(f"{count} Gaussians, in {size} bytes of positions")
+
+    def pixels(part: dict[str, Any], number: int = 0, rows: int | None = count) -> Bytes:
+        name = part["files"][number]
+        with Image.open(io.BytesIO(packed(part, number))) as picture:
             if rows is not None and picture.width * picture.height < rows:
                 raise ValueError(f"{name} is {picture.width} x {picture.height}, too small for {rows}")
             found = np.asarray(picture.convert("RGBA"))

@@ -55,7 +55,7 @@ def read_ksplat(path: Path) -> Arrays:
         kind = np.dtype([*row, ("sh", harmonic, (0, 9, 24, 45)[degree])])
         middles_at = at + 4 * partial
         splats_at = middles_at + buckets * width
-        if splats_at + used * kind.itemsize > len(data):
+        if splats_at + used * kind.itemsize > len(data) or (level and full > buckets):
             raise ValueError(f"not a readable .ksplat file: section {k} reaches beyond its end")
         g, means = np.frombuffer(data, kind, used, splats_at), 0.0
         if level:
@@ -120,7 +120,7 @@ def read_splat(path: Path) -> Arrays:
         if bad.size:
             raise ValueError(f"{name} are not valid in {bad.size} rows, the first is {bad[0]}")
     return {
-        "means": rows["means"],
+        "means": rows["means"].copy(),  # a view of a single row would be of `data`, which is constant
         "scales": np.log(np.maximum(rows["scales"], LEAST_SCALE)),
         "quats": (rows["quats"].astype(np.float64) - 128) / 128,
         "opacities": to_logits(rows["colors"][:, 3] / 255, 1 / 255),
