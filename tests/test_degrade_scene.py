@@ -206,10 +206,12 @@ def test_jpeg_after_lowres_is_the_small_file(tmp_path: Path) -> None:
 
 
 def test_small_photos_are_read_at_the_stored_size_only(tmp_path: Path) -> None:
-    back = load_scene(write(colmap_scene(tmp_path), tmp_path / "out", "lowres:2"), downscale=2)
-    assert {view.image.shape for view in back.train} == {(18, 24, 3)}
-    assert [view.low for view in back.train] == [None] * 7
-    assert len(back.test) == 2
+    out = write(colmap_scene(tmp_path), tmp_path / "out", "lowres:2")
+    for asked in ({"downscale": 2}, {"longest": 24}):
+        back = load_scene(out, **asked)
+        assert {view.image.shape for view in back.train} == {(18, 24, 3)}
+        assert [view.low for view in back.train] == [None] * 7
+        assert len(back.test) == 2
 
 
 def test_names_in_folders_masks_and_a_split_of_its_own(tmp_path: Path) -> None:

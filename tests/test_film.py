@@ -94,6 +94,15 @@ def test_the_sharpest_frame_of_each_interval_is_taken_once(tmp_path: Path) -> No
     assert stages[-1].done == 60
     with Image.open(folder / names[0]) as picture:
         assert picture.size == (128, 96)
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+
+    def other(stage: Stage) -> None:  # another process is faster
+        if not (tmp_path / "twice").is_dir():
+            film_frames(source, tmp_path / "twice", 6)
+
+    both, _ = film_frames(source, tmp_path / "twice", 6, other)
+    assert sorted(path.name for path in both.glob("*.jpg")) == names
+    assert [path.name for path in both.parent.iterdir()] == [both.name]
     times = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
     again, _ = film_frames(source, tmp_path / "frames", 6)
     assert {path: path.stat().st_mtime_ns for path in again.iterdir()} == times

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,8 @@ from PIL import Image, ImageDraw, features
 from hqgs.base.stages import Stage
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import LARGEST, UnreadableError, decode, decode_mask, glance
-from hqgs.scene.film import check_film
+from hqgs.scene.checks import elsewhere
+from hqgs.scene.film import check_film, frame_details
 from hqgs.scene.load import load_scene
 from hqgs.scene.names import existing_folder
 from hqgs.scene.photo_files import film_at
@@ -76,8 +79,32 @@ def test_frames_of_a_film_that_stands_still_all_stay(tmp_path: Path) -> None:
     for k in range(3):
         picture(0).save(tmp_path / f"{k}.png")
     assert looked_at(tmp_path).names == ["0.png"]
+    for theirs in ("[]", '{"fps": 30}'):  # of another program
+        (tmp_path / "frames.json").write_text(theirs)
+        assert looked_at(tmp_path).names == ["0.png"]
+        assert frame_details(tmp_path) == {}
     (tmp_path / "frames.json").write_text("{}")
     assert looked_at(tmp_path).names == ["0.png", "1.png", "2.png"]
+
+
+def test_folders_that_cannot_be_listed_are_passed_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A card's lost+found, and a shared disk above the photos. (The system lets root list all.)"""
+    root, access = tmp_path / "card", os.access
+    (root / "lost+found").mkdir(parents=True)
+    for k in range(3):
+        picture(k).save(root / f"{k}.png")
+    closed = {str(root / "lost+found"), str(tmp_path)}
+    monkeypatch.setattr(os, "access", lambda path, mode: str(path) not in closed and access(path, mode))
+    iterdir = Path.iterdir
+
+    def listed(path: Path) -> Iterator[Path]:
+        if str(path) in closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return iterdir(path)
+
+    monkeypatch.setattr(Path, "iterdir", listed)
+    assert looked_at(root).names == ["0.png", "1.png", "2.png"]
+    assert elsewhere(root) == []
 
 
 def test_photos_in_folders_below_others_are_told(tmp_path: Path) -> None:

@@ -225,3 +225,16 @@ def test_cameras_of_photos_as_exif_shows_them(tmp_path: Path, orientation: int) 
     upright = load_scene(write_colmap(truth, tmp_path / "upright"), downscale=2, test_every=0)
     for view, small in zip(load_scene(tmp_path, downscale=2, test_every=0).train, upright.train, strict=True):
         np.testing.assert_array_equal(view.image, small.image)
+
+
+def test_photos_upside_down_go_as_those_on_their_side(tmp_path: Path) -> None:
+    """Shapes tell of 6 and 8 that cameras are those of photos as EXIF shows them; of 3 they do not."""
+    truth = make_truth(4)
+    write_colmap(truth, tmp_path, images=None)
+    (tmp_path / "images").mkdir()
+    for name, photo, number in zip(truth.names, truth.photos, (1, 6, 3, 8), strict=True):
+        stored = oriented(photo, {6: 8, 8: 6}.get(number, number))
+        Image.fromarray(stored).save(tmp_path / "images" / name, exif=exif(number))
+    for view, photo in zip(load_scene(tmp_path, test_every=0).train, truth.photos, strict=True):
+        np.testing.assert_array_equal(view.image, photo)
+        assert view.quarter_turns == 0

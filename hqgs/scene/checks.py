@@ -12,7 +12,7 @@ from hqgs.scene.formats.colmap import find_models, half_model
 from hqgs.scene.formats.llff import POSES
 from hqgs.scene.formats.transforms import SINGLE, TRAIN
 from hqgs.scene.names import ARCHIVE_SUFFIXES, FILM_SUFFIXES
-from hqgs.scene.photo_files import is_run
+from hqgs.scene.photo_files import can_be_listed, is_run
 
 CAMERAS = (SINGLE, TRAIN, POSES)
 
@@ -54,7 +54,7 @@ def beside(*folders: Path) -> list[str]:
 def elsewhere(root: Path) -> list[str]:
     """That folders above or below the photos hold cameras, which are not read; or nothing."""
     parent, told = root.parent, list[str]()
-    above = ["colmap"] if find_models(parent) else []
+    above = ["colmap"] if can_be_listed(parent) and find_models(parent) else []
     above += [name for name in CAMERAS if (parent / name).is_file()]
     if above:
         which = f"{parent} holds cameras and points ({', '.join(above)})"

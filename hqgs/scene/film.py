@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import missing_folders, read_json, remove_empty, write_json
+from hqgs.base.files import new_folder, read_json, write_json
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import as_text
 from hqgs.photos.film_colors import KNEE, as_photo, film_colors
@@ -52,23 +51,19 @@ def film_frames(
     state = path.stat()
     rule = f"{count} {FRAMES_A_SECOND} {FRAMES_FEWEST} {FRAMES_MOST}"
     name = f"10 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
-    target = folder / hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+    target = folder.resolve() / hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
     if not target.is_dir():
-        new = folder / f".{target.name}"
-        shutil.rmtree(new, ignore_errors=True)
-        made = missing_folders(folder)
-        new.mkdir(parents=True)
         try:
-            details, told = dict[str, float](), dict[str, None]()
-            for number, frame in _sharpest(av, path, count, on_stage, told):
-                file = new / f"{number:06d}.jpg"
-                Image.fromarray(frame).save(file, quality=JPEG_QUALITY, subsampling=0)
-                details[file.name] = fine_detail(frame.astype(np.float64))
-            write_details(new, details, around, [*told])
-            new.rename(target)
-        finally:
-            shutil.rmtree(new, ignore_errors=True)
-            remove_empty(made)  # nothing is left of a film that cannot be read
+            with new_folder(target) as new:  # nothing is left of a film that cannot be read
+                details, told = dict[str, float](), dict[str, None]()
+                for number, frame in _sharpest(av, path, count, on_stage, told):
+                    file = new / f"{number:06d}.jpg"
+                    Image.fromarray(frame).save(file, quality=JPEG_QUALITY, subsampling=0)
+                    details[file.name] = fine_detail(frame.astype(np.float64))
+                write_details(new, details, around, [*told])
+        except OSError:
+            if not target.is_dir():  # another process was first: its frames are the same
+                raise
     frames = len(list(target.glob("*.jpg")))
     note = f"the sharpest {frames} frames of {as_text(path.name)}, one for each interval"
     if told := _written(target).get("told"):
@@ -115,13 +110,24 @@ def frame_details(folder: Path) -> dict[str, float]:
     ValueError where its file is damaged.
     """
     path = folder / FRAMES
-    if not path.is_file():
+    if not of_film(folder):
         return {}
     try:
         details = json.loads(path.read_text(encoding="utf-8"))["details"]
         return {name: float(detail) for name, detail in details.items()}
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {error!r}") from error
+
+
+def of_film(folder: Path) -> bool:
+    """Whether a folder says that it holds frames of a film; other programs write a file of this name, too."""
+    try:
+        written = read_json(folder / FRAMES)
+    except OSError:
+        return False
+    except ValueError:
+        return True  # damaged
+    return isinstance(written, dict) and (not written or "details" in written)
 
 
 def frames_around(folder: Path) -> bool:

@@ -83,7 +83,8 @@ def load_scene(asked: FolderCall) -> Scene:
     held_out = held_out_names(root, capture, test_every, notes, degraded)
     capture = without_poseless(root, without_missing(root, capture, notes), notes)
     capture = replace(capture, photos=masks.with_turns(capture.photos, notes))
-    capture, views = _views(root, capture, asked, degraded if downscale == 1 else None, held_out, notes)
+    small = degraded if downscale == capture.downscale == 1 else None
+    capture, views = _views(root, capture, asked, small, held_out, notes)
     place = located(capture)
     scene = Scene(
         root.name,

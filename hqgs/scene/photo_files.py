@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path, PurePosixPath
 from unicodedata import normalize
@@ -36,8 +36,14 @@ Key = tuple[str, ...]
 
 def is_run(folder: Path) -> bool:
     """Whether a folder is one that `hqgs train` writes or wrote: its pictures are no photos."""
-    wrote = (folder / CONFIG).is_file() and any((folder / name).exists() for name in (PLY, CHECKPOINT))
-    return wrote or (folder / LOCK).is_file()
+    inside = partial(os.path.join, folder)  # os.path: no error where they cannot be looked at
+    wrote = os.path.isfile(inside(CONFIG)) and any(os.path.exists(inside(name)) for name in (PLY, CHECKPOINT))
+    return wrote or os.path.isfile(inside(LOCK))
+
+
+def can_be_listed(folder: Path) -> bool:
+    """Not a card's lost+found, nor what a shared disk lets nobody list."""
+    return os.access(folder, os.R_OK | os.X_OK)
 
 
 def of_maps(folder: str) -> bool:

@@ -85,12 +85,13 @@ def load_views(
             return made(key)
 
     unreadable: dict[str, UnreadableError] = {}
+    shown = any(map(_only_as_shown, photos))
 
     def load(faces: list[Photo]) -> list[View]:
         views, decoded = list[View](), None
         for photo in faces:
             try:
-                decoded = decoded or _decoded(photo, downscale, over)
+                decoded = decoded or _decoded(photo, downscale, over, shown)
                 views.append(_view(photo, decoded, downscale, pinhole, over is not None))
             except UnreadableError as error:
                 if photo.name not in optional:
@@ -133,13 +134,25 @@ class _Decoded:
         return self.kept[width, height]
 
 
-def _decoded(photo: Photo, downscale: float, over: tuple[float, float, float] | None) -> _Decoded:
+def _only_as_shown(photo: Photo) -> bool:
+    """Whether it fits its camera only if it is turned as EXIF says."""
+    if not read_exif(photo.path).quarter_turns % 2:
+        return False
+    width, height = stored_size(photo.path)
+    return not fits(photo.camera, width, height) and fits(photo.camera, height, width)
+
+
+def _decoded(
+    photo: Photo, downscale: float, over: tuple[float, float, float] | None, others_shown: bool
+) -> _Decoded:
+    """`others_shown`: whether there are photos of the capture that fit only as EXIF shows them."""
     camera, stored = photo.camera, stored_size(photo.path)
     exif = read_exif(photo.path)
     turns, shown = exif.quarter_turns, 1
-    if turns % 2 and not fits(camera, *stored) and fits(camera, stored[1], stored[0]):
+    turned = (stored[1], stored[0]) if turns % 2 else stored
+    if fits(camera, *turned) and (others_shown or not fits(camera, *stored)):
         # the cameras are those of photos as EXIF shows them
-        stored, turns, shown = (stored[1], stored[0]), 0, exif.orientation
+        stored, turns, shown = turned, 0, exif.orientation
     check_size(camera, *stored, photo.name)
     # A mask hides colours that must not be mixed into what it shows: such photos are decoded whole.
     enough = downscale > 1 and photo.mask_path is None

@@ -32,7 +32,7 @@ from hqgs.scene.geometry import project
 from hqgs.scene.masks import masks_of
 from hqgs.scene.named_split import held_out, listed_split, names_by_any
 from hqgs.scene.names import KEPT
-from hqgs.scene.photo_files import Named, is_mask_folder, is_run, of_maps, of_windows
+from hqgs.scene.photo_files import Named, can_be_listed, is_mask_folder, is_run, of_maps, of_windows
 from hqgs.scene.scene import Camera, TrackStatistics
 
 _POINT_FILES = (f"{POINTS}.ply", "points.ply", "input.ply")  # in place of COLMAP's own
@@ -77,7 +77,7 @@ def _called_model(folder: Path) -> bool:
 
 def _folders(folder: Path) -> list[Path]:
     """Those in which a scene may lie."""
-    inner = (p for p in folder.iterdir() if p.is_dir() and p.name[0] != ".")
+    inner = (p for p in folder.iterdir() if p.is_dir() and p.name[0] != "." and can_be_listed(p))
     return sorted(p for p in inner if not is_run(p) and (p.name != KEPT or _sparse(p).is_dir()))
 
 
@@ -368,6 +368,7 @@ def photos_of(
     base = model.parent.parent if model.parent.name == "sparse" else model.parent
     beside = [place / name for place in (base, model, root) for name in (INPUT, "images")]
     inner = [p for p in sorted(root.iterdir()) if p.is_dir() and p.name[0] != "." and not is_run(p)]
+    inner = [p for p in inner if can_be_listed(p)]
     maps = [p for p in inner if of_maps(p.name)]
     options = [*beside, model, base, root, *(p for p in inner if p not in maps)]
     options = [p for p in dict.fromkeys(options) if p.is_dir() and p.is_relative_to(root)]

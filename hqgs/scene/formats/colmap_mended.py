@@ -110,7 +110,7 @@ def _photo_lines(text: bytes, notes: list[str]) -> bytes:
         if not _is_photo(line):
             continue
         shown = found[k + 1] if k + 1 < len(found) else ""
-        if _is_photo(shown) or shown.startswith("#"):
+        if _is_photo(shown) or shown.startswith("#") or (not shown and k + 2 >= len(found)):
             whole, shown = False, ""
         words = line.strip().split(None, HEAD)
         if all(_is_number(word) and math.isfinite(float(word)) for word in words[1 : HEAD - 1]):

@@ -24,9 +24,9 @@ from hqgs.scene.capture import photo_folder
 from hqgs.scene.checks import beside
 from hqgs.scene.constants import JPEG_QUALITY, MAX_WORKERS, MOST_SIDE
 from hqgs.scene.faces import CUBE, face_name
-from hqgs.scene.film import frames_around
-from hqgs.scene.names import FRAMES, KEPT
-from hqgs.scene.photo_files import is_mask_folder, is_run, masks_among, of_maps
+from hqgs.scene.film import frames_around, of_film
+from hqgs.scene.names import KEPT
+from hqgs.scene.photo_files import can_be_listed, is_mask_folder, is_run, masks_among, of_maps
 from hqgs.scene.sfm.copies import copies
 from hqgs.scene.sfm.database import seen_size
 from hqgs.scene.sfm.panoramas import all_around, colmap_faces, faces_seen
@@ -203,7 +203,7 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     """
     looked, unreadable = _looked_at(photos, on_stage)
     tags = {name: read_exif(photos.folder / name) for name in looked}
-    film, notes = (photos.folder / FRAMES).is_file(), list(photos.notes)
+    film, notes = of_film(photos.folder), list(photos.notes)
     twice = {} if film else copies(photos.folder, looked, tags)
     if twice:
         pairs = some([f"{name} (of {own})" for name, own in twice.items()])
@@ -312,7 +312,7 @@ def _photos_in_folders(root: Path) -> dict[Path, list[str]]:
             for p in place.iterdir()
             if p.is_dir()
             and not (is_mask_folder(p.name) or p.name == KEPT or p.name[0] == "." or is_run(p))
-            and os.access(p, os.R_OK | os.X_OK)  # not a card's lost+found
+            and can_be_listed(p)
         )
         once = {p.resolve(): p for p in sorted(inner, key=lambda p: (not p.is_symlink(), p))}
         level = sorted(p for real, p in once.items() if real not in seen)
