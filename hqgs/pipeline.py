@@ -88,7 +88,7 @@ class Progress:
     def psnr(self) -> float | None:
         """Of the render against the training photo, dB. None where it is infinite or nothing counts."""
         step = self._step
-        return psnr(self.render, step.view.image, step.view.mask)
+        return psnr(self.render, step.view.image, step.view.mask) if self.render.size else None
 
 
 OnProgress = Callable[[Progress], None]
@@ -188,7 +188,7 @@ def train(call: TrainCall) -> Run:
     said, before = call.said(), call.config
     if before is not None:
         said = merged(said_by(before) if isinstance(before, TrainConfig) else before, said)
-    elif taken and call.resume and out is not None:
+    elif ranks.first and call.resume and out is not None:  # also one that was killed before a checkpoint
         said = resumed(out, said)
     said = ranks.tell(said if ranks.first else None)[0]
     if out is not None and ranks.first and not taken:
@@ -320,7 +320,7 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
     if decisions.turned:
         config = replace(config, turn=(decisions.turned, decisions.length))
     model, left_out = trainer.model(), list[LeftOut]()
-    model.look, model.world = (scene.test or scene.train)[0].camera, scene.world
+    model.look, model.world = (scene.test or scene.train)[0].upright_camera, scene.world
     if out is not None and (rows := model.save(out / PLY)):
         left_out.append(LeftOut(f"{rows} Gaussians in {PLY}", "their values are NaN or Inf"))
     if guard.skipped:

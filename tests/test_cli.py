@@ -300,6 +300,23 @@ def test_ctrl_c_while_the_scene_is_read_is_exit_code_130(
     assert call("train", "embedded", "--out", tmp_path) == 130
 
 
+def test_a_run_that_was_killed_before_its_checkpoint_is_asked_for_the_same(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["train", "embedded", "--out", tmp_path]
+    assert call(*command, "--iterations", "2", "--method", "3dgs", "--seed", "5", "--downscale", "2") == 0
+    for name in ("checkpoint.safetensors", "scene.ply", "report.json"):
+        (tmp_path / name).unlink()
+    capsys.readouterr()
+    assert call(*command, "--resume") == 0
+    assert capsys.readouterr().out.startswith(
+        f"--resume: {tmp_path} holds a run without checkpoint: it starts"
+    )
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert [config["train"][name] for name in ("iterations", "method", "seed")] == [2, "3dgs", 5]
+    assert asked[1] == asked[0]
+
+
 def test_a_resumed_run_has_the_scene_that_it_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its size, its held-out views and its degradation, without saying them again."""
     calls: list[dict[str, Any]] = []

@@ -6,14 +6,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
+import torch
 from run_state import assert_stopped_alike, run_until
 from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 from hqgs.base.left_out import CORRECTION, DIAGNOSIS, PHOTO, LeftOut, format_left_out
 from hqgs.base.ranks import ALONE
+from hqgs.photos.pixels import to_uint8
 from hqgs.pipeline import train
 from hqgs.scene.scene import Scene
 from hqgs.training import rules
@@ -155,6 +158,24 @@ def test_photos_of_which_masks_leave_nothing_do_not_count(monkeypatch: pytest.Mo
     assert np.isnan(psnr([held]))
     assert run_until(trainer).length == 30
     assert left_out_of(trainer.state.rows) == []
+
+
+def test_noise_that_black_and_white_cut_off_does_not_make_a_run_perfect() -> None:
+    """Stored photos hold less noise than was added: what is left of an error would be below 0."""
+    noise, scene = 30 / 255, tiny_scene(VIEWS)
+    rng = np.random.default_rng(0)
+    pure = {view.name: 0.06 + 0.6 * (rng.random((HEIGHT, WIDTH, 3)) > 0.4) for view in scene.train}
+    noisy = [
+        replace(view, image=to_uint8((pure[view.name] + rng.normal(0, noise, (HEIGHT, WIDTH, 3))).clip(0, 1)))
+        for view in scene.train
+    ]
+    config = tiny_config(30, method="hqgs", hqgs=HQGSConfig(formation="noise:30"))
+    training = Trainer(replace(scene, train=noisy), config).prepared.training_views
+    for off, wanted in ((0.05, 26.0), (0.1, 20.0)):
+        renders = {view.name: torch.from_numpy(pure[view.name] + off).float() for view in noisy}
+        with patch.object(training, "taken", lambda _, k, *__: renders[noisy[k].name]):  # noqa: B023
+            found = training.psnr(training, range(len(noisy)), 0, False, ALONE)  # type: ignore[arg-type]
+        assert abs(found - wanted) < 1.5
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,6 +51,15 @@ class Held:
         return self.plateau.rate_left
 
 
+def test_rates_that_move_nothing_are_not_halved_to_nothing() -> None:
+    """A report says which part of them was left."""
+    plateau = Plateau(1)
+    for _ in range(1200):
+        for _ in range(PLATEAU_STEPS):
+            plateau.see(0, torch.tensor(1.0))
+    assert 0 < plateau.rate_left < 1e-10
+
+
 def look(held: Held, given: Photos, offset: float) -> None:
     """As many steps as lie between two looks, with renders that are `offset` off."""
     names = list(given)

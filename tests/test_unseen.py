@@ -12,6 +12,7 @@ import pytest
 from fixtures_scenes import Truth, make_truth, photographed, write_colmap
 from numpy.typing import NDArray
 from PIL import Image
+from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
 from benchmarks.scenes.sparse import sparse_cameras
@@ -209,6 +210,15 @@ def test_a_run_that_ends_below_one_flat_colour_says_so(tmp_path: Path) -> None:
     assert run.report.get("fallen") == run.report["notes"][0]
     sound = hqgs.load("embedded", downscale=12)
     assert "fallen" not in hqgs.train(sound, iterations=40, method="3dgs").report
+
+
+def test_a_held_out_photo_that_its_mask_hides_says_nothing_of_the_run() -> None:
+    scene = tiny_scene()
+    (view,) = scene.test
+    hidden = replace(view, mask=np.zeros(view.image.shape[:2], bool))
+    run = hqgs.train(replace(scene, test=[hidden]), config=tiny_config(30))
+    assert run.finished
+    assert "fallen" not in run.report
 
 
 def test_a_run_that_ends_below_its_first_step_says_so() -> None:

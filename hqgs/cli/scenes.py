@@ -21,7 +21,7 @@ from hqgs.base.options import Factor, Number, Unsaid, given
 from hqgs.base.text import some
 from hqgs.cli.errors import fail
 from hqgs.scene.names import existing_folder, is_room
-from hqgs.scene.photo_files import film_at, strangers
+from hqgs.scene.photo_files import film_at, is_run, strangers
 from hqgs.training.config import longest_side
 
 if TYPE_CHECKING:
@@ -180,7 +180,8 @@ def check_out(out: Path, scene: str, resume: bool, overwrite: bool) -> list[str]
         raise ValueError(f"--out {out} is the folder of the photos: name another folder for the run")
     if out.exists() and not out.is_dir():
         raise ValueError(f"--out {out} is a file: name a folder for the run")
-    lines = [f"--resume: {out} holds no run; a new one starts"] if resume else []
+    begun = "a run without checkpoint: it starts again" if is_run(out) else "no run; a new one starts"
+    lines = [f"--resume: {out} holds {begun}"] if resume else []
     if others := strangers(out):
         lines.append(
             f"--out {out} also holds other files ({some(others)}): the run writes its files beside them"

@@ -240,7 +240,7 @@ def _checked(options: Train) -> Said:
 def loading(options: Train, config: TrainConfig) -> dict[str, Any]:
     """What `load_as` is to give, as JSON values; where a run goes on, as it was, but for what is said."""
     run = RunFolder(options.out)
-    before = dict(run.loaded) if options.resume and (options.out / CHECKPOINT).exists() else {}
+    before = dict(run.loaded) if options.resume and run.is_run else {}
     if options.downscale is not None or options.preset is not None or not before:
         before |= {"longest": longest_side(options.preset, options.downscale), "downscale": None}
     path = str(options.scene if is_room(options.scene) else Path(options.scene).expanduser().resolve())

@@ -12,12 +12,13 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import tyro
 
-from hqgs.base.files import CHECKPOINT, CONFIG, PLAN, read_json
+from hqgs.base.files import CONFIG, PLAN, read_json
 from hqgs.base.options import Number, Seconds, Seed, Unsaid, choice
 from hqgs.base.typed import build
 from hqgs.model.constants import MAX_SH_DEGREE
 from hqgs.photos.formula import parse_formation
 from hqgs.scene.constants import BACKGROUND
+from hqgs.scene.photo_files import is_run
 
 AUTO, NONE = "auto", "none"
 METHODS = {
@@ -365,7 +366,7 @@ def read_said(path: str | Path) -> Said:
 
 def resumed(folder: Path, now: Said) -> Said:
     """What is said of the run in a folder, before and now. ValueError where it would be shorter."""
-    before = read_said(folder) if (folder / CHECKPOINT).exists() and (folder / CONFIG).is_file() else {}
+    before = read_said(folder) if is_run(folder) and (folder / CONFIG).is_file() else {}
     said = merged(before, now)
     if "iterations" in before and "iterations" in now and said["iterations"] < before["iterations"]:
         raise ValueError(

@@ -131,18 +131,23 @@ class TrainingViews:
         a degree; known noise does not count, nor do photos whose masks leave nothing. NaN where all are such.
         """
 
+        noise = self.method.noise
+
         def error(number: int) -> float | None:
             target = self.target(number, coarse)[1]
             image = self.method.compare(self.taken(gaussians, number, degree, coarse), target)
             difference = (image - floats(target.photo)).square()
             if target.mask is not None:
-                difference = difference[target.mask]
+                image, difference = image[target.mask], difference[target.mask]
+            if noise:  # nearer to black and white it is cut off
+                difference = difference[(image - 0.5).abs() < 0.5 - 1.5 * noise]
             return float(difference.double().mean()) if len(difference) else None
 
         errors = [found for found in ranks.divide(numbers, error) if found is not None]
         if not errors:
             return math.nan
-        return -10 * math.log10(max(float(np.mean(errors)) - self.method.noise**2, 1e-10))
+        left = float(np.mean(errors)) - noise**2
+        return math.nan if left <= 0 < noise else -10 * math.log10(max(left, 1e-10))
 
 
 def gradients_of_one(plan: StepPlan, training: TrainingViews, state: TrainState) -> Gradients:

@@ -34,6 +34,8 @@ def fell_short(trainer: Trainer) -> str | None:
     degree = trainer.schedule.degree(trainer.iteration)
     ends = [*HeldOutViews(asked, trainer.model(), degree, background)]  # rendered once, read twice
     photos = [as_floats(view.image)[... if view.mask is None else view.mask].reshape(-1, 3) for view in asked]
+    if not sum(map(len, photos)):  # masks hide all of them
+        return None
     color = np.concatenate(photos).mean(0)
     flats = [replace(end, render=np.broadcast_to(color, end.photo.shape)) for end in ends]
     of = (ends, flats, HeldOutViews(asked, first, 0, background))

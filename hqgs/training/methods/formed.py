@@ -119,6 +119,7 @@ def _analysis(side: int, halve: bool) -> NDArray[np.float64]:
 
 
 HELD_PIXELS = 50  # one pixel of so many is held back under noise
+LEAST_RATE = 1e-12  # share of the learning rates, at which nothing moves
 PLATEAU_STEPS = 200  # from one look at them to the next, at least; without a gain the rates are halved
 
 
@@ -194,7 +195,7 @@ class Plateau:
         gains = self._best - now
         known = torch.isfinite(gains)
         if known.any() and gains[known].mean() <= 0:
-            self.rate_left /= 2
+            self.rate_left = max(self.rate_left / 2, LEAST_RATE)
         else:
             self._best = torch.where(torch.isfinite(now), now, self._best)
         self._sums.zero_()
