@@ -13,6 +13,7 @@ import torch
 from run_state import run_until
 from tiny_scene import tiny_config, tiny_scene
 
+import hqgs
 from hqgs.cli.main import main
 from hqgs.evaluation.run_folder import RunFolder
 from hqgs.model.gaussians import Gaussians
@@ -132,6 +133,15 @@ def test_nothing_is_written_where_the_file_does_not_gain(
         assert not (tmp_path / name).exists()
     assert asked == [(9, (1.0, 0.5, 0.0))] * 2
     assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
+
+
+def test_a_run_that_corrects_its_photos_is_not_fitted_to_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: scene())
+    hqgs.train(hqgs.load("embedded"), out=tmp_path, iterations=2, method="hqgs", formation="blur:1")
+    assert main(["clean", str(tmp_path), "--out", str(tmp_path / "new.ply"), "--steps", "1"]) == 2
+    assert "is a run that corrects its photos (blur:1)" in capsys.readouterr().err
 
 
 def test_bad_input_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

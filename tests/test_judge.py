@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from tiny_scene import tiny_config, tiny_scene
 import hqgs
 from hqgs._rust import EPS2D
 from hqgs.cli.main import main
+from hqgs.evaluation import held_out
 from hqgs.evaluation.causes import PARTS, causes, pixel_maps, shares, shown_by
 from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.evaluation.held_out import RenderedView
@@ -26,6 +28,7 @@ from hqgs.evaluation.judge import VERSION, flat_psnr
 from hqgs.evaluation.metrics import METRICS
 from hqgs.evaluation.verdict import judged_by, overdone, verdict
 from hqgs.model.gaussians import Gaussians
+from hqgs.photos.look import Look
 from hqgs.scene import source as scene_source
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene
@@ -112,6 +115,23 @@ def test_two_scenes_are_compared_photo_by_photo(
     same = json.loads((tmp_path / "same" / "judge.json").read_text())["difference"]
     assert same["psnr"] == {"mean": 0.0, "interval": 0.0, "sure": False}
     assert "(not significant)" in capsys.readouterr().out
+
+
+def test_both_scenes_are_measured_in_the_look_of_the_run(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look = Look(np.full(3, 0.8), np.zeros(2), np.zeros((2, 3)))
+    monkeypatch.setattr(
+        held_out, "looks_beside", lambda file, _: {"": look} if file.parent == run else dict[str, Look]()
+    )
+    shutil.copy(run / "scene.ply", tmp_path / "same.ply")
+    photos = ["--photos", "embedded"]
+    assert judge(tmp_path / "same.ply", *photos, "--against", run, "--out", tmp_path / "both") == 0
+    found = json.loads((tmp_path / "both" / "judge.json").read_text())
+    assert found["protocol"]["looks"] is True
+    assert found["difference"]["psnr"]["mean"] == 0
+    assert judge(tmp_path / "same.ply", *photos, "--out", tmp_path / "bare") == 0
+    assert judge(run, "--against", tmp_path / "bare" / "judge.json") == 2
 
 
 def test_a_bright_photo_of_many_pixels_is_flat_to_all_digits() -> None:

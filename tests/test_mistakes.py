@@ -90,6 +90,7 @@ MISTAKES = {
     "judge a.ply --photos nowhere --out notes.txt/a": "--out notes.txt/a is inside {root}/notes.txt",
     "diagnose nowhere --out empty": "--out empty is a folder: name the file to write",
     "plan photos --out nowhere": "--out nowhere: there is no run; leave --out away",
+    "plan photos --test-every 1": "no photo is left to train on",
     "clean a.ply --out b.ply": "give --photos, a folder of photos",
     "degrade scene --kind noise:25 --out photos": "photos exists and is not an empty folder",
     "degrade x --out y --degrade blur:2": "missing: --kind KIND; there is no option --degrade (h",

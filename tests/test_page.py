@@ -15,11 +15,11 @@ import pytest
 import torch
 from PIL import Image
 from test_ply import random_gaussians
-from tiny_scene import tiny_config, tiny_scene
+from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 import hqgs
 from hqgs.show.page.packing import pack_scene
-from hqgs.show.page.page import line_chart, page_text, told_verdict
+from hqgs.show.page.page import _scene, line_chart, page_text, told_verdict
 
 
 @pytest.fixture(scope="module")
@@ -219,6 +219,20 @@ def test_a_scene_shows_itself_from_a_camera_of_its_run(tmp_path: Path) -> None:
     html = run._repr_html_()
     assert html.count("data:image/jpeg;base64,") == 2
     assert "30 iterations" in html
+
+
+def test_photos_on_their_side_are_shown_upright(run: hqgs.Run) -> None:
+    """In a notebook, and by the page's viewer, as cameras.json and the pictures beside are."""
+    made = tiny_scene()
+    train, test = ([replace(view, quarter_turns=1) for view in views] for views in (made.train, made.test))
+    scene = replace(made, train=train, test=test)
+    shown = _scene(scene, run.model, [0, 0, 0])
+    assert shown["aspect"] == f"{HEIGHT} / {WIDTH}"
+    assert np.dot(shown["up"], shown["views"][0]["R"][1]) < -0.9  # the picture's y is down
+    look, upright = hqgs.train(scene, config=tiny_config(2)).model.look, test[0].upright_camera
+    assert look is not None
+    assert np.array_equal(look.viewmat, upright.viewmat)
+    assert (look.width, look.height) == (HEIGHT, WIDTH)
 
 
 def test_a_bare_scene_shows_itself_whole(tmp_path: Path) -> None:

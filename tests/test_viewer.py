@@ -308,6 +308,10 @@ def test_a_path_that_was_made_in_the_page_is_rendered(folder: Path, tmp_path: Pa
         assert (
             f"`hqgs render {folder} --path {folder}/camera_path.json --out path.mp4`" in viewer._told.content
         )
+        viewer._folder = folder / "gone"
+        (folder / "gone").write_text("a file")
+        viewer._save(None)
+        assert "2 views. Not saved: " in viewer._told.content
     cameras, fps = load_path(folder / "camera_path.json")
     assert (len(cameras), fps, cameras[0].height) == (30, 30, 720)
     np.testing.assert_allclose([cameras[0].center[0], cameras[-1].center[0]], [0, 0.2], atol=1e-6)

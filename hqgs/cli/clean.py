@@ -14,6 +14,7 @@ from hqgs.cli.errors import fail
 from hqgs.cli.judge import check_source
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import MeasuredOptions, check_out_file, measured_scene, tell_read
+from hqgs.photos.formula import NONE
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
@@ -47,6 +48,12 @@ def run(options: Clean) -> int:
     steps = given(options.steps, CLEANING_STEPS)
     check_steps(steps)
     run = RunFolder.open(options.source)
+    plan = [] if run.report is None else run.report["plan"]
+    if undone := [row["value"] for row in plan if row["what"] == "formation" and row["value"] != NONE]:
+        raise ValueError(
+            f"{options.source} is a run that corrects its photos ({undone[-1]}): cleaning would fit the "
+            "scene to the photos as they are"
+        )
     background = run.background
     with LoadingScreen() as screen:
         scene = measured_scene(run, options, screen)

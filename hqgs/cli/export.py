@@ -12,7 +12,7 @@ from hqgs.base.options import Factor, Flag, Number, Unsaid, values
 from hqgs.base.text import markdown_table
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import MeasuredOptions, check_out_file, measured_scene, ready, tell_read
-from hqgs.model.formats.files import FORMATS, WRITTEN, format_of, scene_file
+from hqgs.model.formats.files import FORMATS, WRITTEN, bytes_of, format_of, scene_file
 from hqgs.show.export_options import ExportOptions
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def run(args: ExportScene) -> int:
     if args.trust and not FORMATS[options.format].errors:
         places = " and ".join(f".{name}" for name, format in FORMATS.items() if format.errors)
         raise ValueError(f"--trust: a .{options.format} file cannot store it; {places} files can")
-    from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
+    from hqgs.evaluation.held_out import held_out_psnr, held_out_renders, looks_beside  # here: torch
     from hqgs.evaluation.run_folder import RunFolder
     from hqgs.model.gaussians import Gaussians
     from hqgs.show.export import export, measure
@@ -82,7 +82,8 @@ def run(args: ExportScene) -> int:
     def held_out(shown: Gaussians) -> float | None:
         if scene is None:
             return None
-        renders = held_out_renders(scene, shown, background=run.background)
+        looks = looks_beside(source, scene.train)  # that the run measures with
+        renders = held_out_renders(scene, shown, background=run.background, looks=looks)
         return held_out_psnr(scene, renders)
 
     before = held_out(gaussians)
@@ -126,7 +127,7 @@ def _held_out_photos(run: RunFolder, args: ExportScene) -> Scene:
 def _table(
     source: Path, gaussians: Gaussians, before: float | None, written: Export, after: float | None
 ) -> str:
-    size = source.stat().st_size
+    size = bytes_of(source)
     head = ["file", "Gaussians", "SH degree", "bytes", "of the source"]
     rows = [
         [str(source), f"{len(gaussians):,}", str(gaussians.sh_degree), f"{size:,}", ""],

@@ -49,7 +49,8 @@ def run(options: Info) -> int:
 def _file(path: Path) -> list[str]:
     import numpy as np
 
-    from hqgs.model.gaussians import Gaussians  # here: it loads torch
+    from hqgs.model.formats.files import bytes_of  # here: they load torch
+    from hqgs.model.gaussians import Gaussians
 
     gaussians = Gaussians.load(path)
     means = gaussians.world.out(gaussians.means.numpy())
@@ -57,7 +58,7 @@ def _file(path: Path) -> list[str]:
     box = ", ".join(f"{low:.3g} to {high:.3g}" for low, high in zip(lowest, highest, strict=True))
     return [
         f"{path}: {len(gaussians):,} Gaussians, harmonics of degree {gaussians.sh_degree}, "
-        f"{path.stat().st_size / 1e6:.3g} MB",
+        f"{bytes_of(path) / 1e6:.3g} MB",
         f"90 % of them lie within x, y, z: {box}",
         *(
             ["it has an error for each Gaussian: hqgs render --show trust shows them"]

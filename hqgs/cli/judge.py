@@ -18,10 +18,10 @@ from hqgs.evaluation.verdict import judged_by, judgement
 
 if TYPE_CHECKING:
     from hqgs.evaluation.held_out import HeldOutViews
+    from hqgs.photos.look import Look
     from hqgs.scene.scene import Scene, View
 
 NUMBERS, PAGE = "judge.json", "judge.html"
-META = "meta.json"  # of a SOG scene that was unpacked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +50,7 @@ def run(options: Judge) -> int:
     if options.out is not None:
         check_out_folder(options.out)
     source, other, known = check_source(options.source, options.photos), None, None
+    from hqgs.evaluation.held_out import looks_beside
     from hqgs.evaluation.judge import (
         check_comparable,
         chosen_views,
@@ -74,13 +75,14 @@ def run(options: Judge) -> int:
         scene = measured_scene(run, options, screen)
         views = chosen_views(scene, options.views)
         background = run.background if options.background is None else options.background
-        protocol = protocol_of(scene, options.views, views, background)
+        files = [file for file in (source, other) if file is not None]
+        # Those of the run that one of them lies in count for both.
+        looks = next((found for file in files if (found := looks_beside(file, scene.train))), {})
+        protocol = protocol_of(scene, options.views, views, background) | {"looks": bool(looks)}
         if known is not None:
             check_comparable(protocol, known["protocol"], str(options.against))
         judged = [
-            judge_file(file, scene, views, background, screen, fit=options.fit_cameras)
-            for file in [source, other]
-            if file is not None
+            judge_file(file, scene, views, background, screen, options.fit_cameras, looks) for file in files
         ]
     found: dict[str, Any] = {"hqgs": __version__, "protocol": protocol, "scene": judged[0][0]}
     if known is not None or other is not None:
@@ -120,17 +122,16 @@ def judge_file(
     views: Sequence[View],
     background: tuple[float, float, float],
     screen: LoadingScreen,
-    fit: bool = False,
+    fit: bool,
+    looks: dict[str, Look],
 ) -> tuple[dict[str, Any], HeldOutViews]:
     """A scene file, measured; what its reading left out is told."""
-    from hqgs.evaluation.held_out import looks_beside
     from hqgs.evaluation.judge import judge
+    from hqgs.model.formats.files import bytes_of
     from hqgs.model.gaussians import Gaussians
 
     gaussians = Gaussians.load(file)
     for note in gaussians.notes:
         screen.say(f"read: {note}")
-    parts = [file] if file.name != META else [path for path in file.parent.iterdir() if path.is_file()]
-    size, held = sum(path.stat().st_size for path in parts), gaussians.in_world(scene.world)
-    looks = looks_beside(file, scene.train)
-    return judge(str(file), size, held, scene, views, background, fit, screen.stage, looks)
+    held = gaussians.in_world(scene.world)
+    return judge(str(file), bytes_of(file), held, scene, views, background, fit, screen.stage, looks)

@@ -55,6 +55,8 @@ def run(options: PlanOptions) -> int:
             scene = load(options.scene, **asked, **finding(told, options.scene))
         else:
             scene = pictures(options.scene, **asked)
+        if not scene.train:
+            raise ValueError(f"{scene.name}: no photo is left to train on")
         later: list[str] = []
         if len(scene.points):
             plan = Prepared(Frame.of(scene), config, begin=Trainer).plan()

@@ -174,6 +174,7 @@ COMPARED = {  # what must be equal, in the order in which it is told
     "pixels": "the photos' pixels or masks (their digest)",
     "background": "the backgrounds",
     "version": "the measuring rules",
+    "looks": "whether renders have the cameras' vignetting and response (of a run that learned them)",
 }
 VERSION = 1  # of RULES: raised where numbers come to differ; a judge.json without one is of the first
 RULES = {
@@ -257,7 +258,7 @@ def read_judgement(path: Path) -> dict[str, Any]:
 def check_comparable(one: Mapping[str, Any], other: Mapping[str, Any], name: str) -> None:
     """ValueError that says by name what keeps the numbers of two protocols from being compared."""
     for key, words in COMPARED.items():
-        here, there = one[key], other.get(key, 1 if key == "version" else None)
+        here, there = one[key], other.get(key, {"version": 1, "looks": False}.get(key))
         if here != there:
             raise ValueError(f"{name} cannot be compared: {words} differ, {_apart(here, there)}")
 

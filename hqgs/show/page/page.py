@@ -198,7 +198,7 @@ def _scene(scene: Scene, gaussians: Gaussians, background: Json) -> dict[str, An
     head, data = pack_scene(gaussians)
     views = [*scene.test, *scene.train]
     views = [views[k] for k in evenly(len(views), MOST_CAMERAS)]
-    cameras = [view.camera for view in views]
+    cameras = [view.upright_camera for view in views]
     middle = focus([view.camera for view in scene.train])
     note = f"{head['count']:,} Gaussians, harmonics of degree {head['degree']}, {len(data) / 1e6:.1f} MB"
     if left_out := len(gaussians) - head["count"]:
@@ -207,7 +207,7 @@ def _scene(scene: Scene, gaussians: Gaussians, background: Json) -> dict[str, An
     return {
         "data": data,
         "head": {**head, "background": background},
-        "views": [{"name": v.name, **_view(v.camera, middle)} for v in views],
+        "views": [{"name": v.name, **_view(c, middle)} for v, c in zip(views, cameras, strict=True)],
         "up": scene_up(scene).tolist(),
         "aspect": f"{first.width} / {first.height}",
         "note": note,

@@ -325,7 +325,10 @@ class Viewer:
             path = self._folder / PATH_FILE
             shown = self._gaussians
             frame = {} if shown is None else {"world": shown.world, "by": shown.moved}
-            save_path(path, self._path(), **frame)
+            try:
+                save_path(path, self._path(), **frame)
+            except OSError as error:
+                return self._tell(f"Not saved: {error}")
             command = ["hqgs", "render", str(self._source), "--path", str(path), "--out", "path.mp4"]
             self._tell(f"Saved. `{shlex.join(command)}`")
 

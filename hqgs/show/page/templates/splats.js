@@ -192,10 +192,12 @@ class SplatViewer {
       e.preventDefault();
       this.zoom(Math.sign(e.deltaY) * Math.min(Math.abs(e.deltaY), 100) * 0.0015);
     }, { passive: false });
+    const key = (e) => e.key.length === 1 ? e.key.toLowerCase() : e.key;  // Shift or Caps Lock may change meanwhile
     canvas.addEventListener("keydown", (e) => {
-      if ("wasdqe".includes(e.key) || e.key.startsWith("Arrow")) { this.keys.add(e.key); e.preventDefault(); this.dirty = true; }
+      if (e.ctrlKey || e.metaKey || !("wasdqe".includes(key(e)) || key(e).startsWith("Arrow"))) return;
+      this.keys.add(key(e)); e.preventDefault(); this.dirty = true;
     });
-    canvas.addEventListener("keyup", (e) => this.keys.delete(e.key));
+    canvas.addEventListener("keyup", (e) => this.keys.delete(key(e)));
     canvas.addEventListener("blur", () => this.keys.clear());
     let last = 0, moved = 0, coarse = 1;
     const tick = (now) => {
