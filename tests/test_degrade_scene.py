@@ -207,8 +207,8 @@ def test_jpeg_after_lowres_is_the_small_file(tmp_path: Path) -> None:
 
 def test_small_photos_are_read_at_the_stored_size_only(tmp_path: Path) -> None:
     out = write(colmap_scene(tmp_path), tmp_path / "out", "lowres:2")
-    for asked in ({"downscale": 2}, {"longest": 24}):
-        back = load_scene(out, **asked)
+    for downscale, longest in ((2, None), (None, 24)):
+        back = load_scene(out, downscale=downscale, longest=longest)
         assert {view.image.shape for view in back.train} == {(18, 24, 3)}
         assert [view.low for view in back.train] == [None] * 7
         assert len(back.test) == 2

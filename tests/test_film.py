@@ -198,9 +198,10 @@ def test_a_scene_from_a_film_knows_it_at_about_its_size(cards: Scene, tmp_path: 
     write_colmap_folder(source, tmp_path / "walk", tmp_path / "sfm", len(views))  # where cameras are kept
     there = load_scene(tmp_path / "walk")
     assert all(view.film == details[view.name] for view in (*there.train, *there.test))
-    (folder / "frames.json").write_text("{}")
-    with pytest.raises(ValueError, match=r"frames\.json is damaged: KeyError\('details'\)"):
-        load(source, frames=len(views), cache=tmp_path)
+    for damage, words in (('{"details": 1}', "is damaged: AttributeError"), ("{", "is not valid JSON")):
+        (folder / "frames.json").write_text(damage)
+        with pytest.raises(ValueError, match=rf"frames\.json {words}"):
+            load(source, frames=len(views), cache=tmp_path)
 
 
 # --- Colours of films: matrix, range and transfer are those that the film names

@@ -165,7 +165,7 @@ def test_several_primitives_and_nodes_are_joined(tmp_path: Path, monkeypatch: py
     assert not read.shN[6:12].any()
     change_gltf(tmp_path / "a.glb", lambda content: nodes(content, 40 * [{}]))
     monkeypatch.setattr(gltf, "MAX_GAUSSIANS", 20)
-    with pytest.raises(ValueError, match="meshes again, more than 20 Gaussians in all"):
+    with pytest.raises(ValueError, match="show more than 20 Gaussians, many again"):
         Gaussians.load(tmp_path / "a.glb")
 
 

@@ -83,7 +83,7 @@ def test_frames_of_a_film_that_stands_still_all_stay(tmp_path: Path) -> None:
         (tmp_path / "frames.json").write_text(theirs)
         assert looked_at(tmp_path).names == ["0.png"]
         assert frame_details(tmp_path) == {}
-    (tmp_path / "frames.json").write_text("{}")
+    (tmp_path / "frames.json").write_text('{"details": {}}')
     assert looked_at(tmp_path).names == ["0.png", "1.png", "2.png"]
 
 

@@ -36,7 +36,7 @@ MISTAKES = {
     "train scene more --out run": "one argument too many: more",
     "train scene --out scene": "is the folder of the photos: name another folder for the run",
     "train scene --out others/../scene/.": "is the folder of the photos: name another folder for the run",
-    "train scene --out notes.txt": "is a file: name a folder for the run",
+    "train scene --out notes.txt": "is a file: name a folder",
     "train scene --out others": "holds config.json, not of a run, which a run would overwrite: name another",
     f"{TRAIN} --overwrte": "there is no option --overwrte - did you mean --overwrite",
     f"{TRAIN} --foo 1 2": "there is no option --foo (hqgs train --help)",

@@ -67,12 +67,9 @@ def run(options: Clean) -> int:
     words = gained(written)
     if not written.pays:
         lossy = f" as a .{format} file, which is less exact" if done.pays else ""
-        held = (
-            ""
-            if options.photos is None
-            else " (photos that the scene was trained on cannot show an improvement)"
-        )
-        return fail(1, f"{source}: held-out photos do not improve{lossy}; nothing was written: {words}{held}")
+        if options.photos is not None:
+            words += " (photos that the scene was trained on cannot show an improvement)"
+        return fail(1, f"{source}: held-out photos do not improve{lossy}; nothing was written: {words}")
     cleaned.save(options.out)
     tell_read(gaussians)
     for what in left_out(gaussians, cleaned, back, format):

@@ -56,15 +56,12 @@ def _file(path: Path) -> list[str]:
     means = gaussians.world.out(gaussians.means.numpy())
     lowest, highest = (np.quantile(means, q, axis=0).tolist() for q in (0.05, 0.95))
     box = ", ".join(f"{low:.3g} to {high:.3g}" for low, high in zip(lowest, highest, strict=True))
+    errors = "it has an error for each Gaussian: hqgs render --show trust shows them"
     return [
         f"{path}: {len(gaussians):,} Gaussians, harmonics of degree {gaussians.sh_degree}, "
         f"{bytes_of(path) / 1e6:.3g} MB",
         f"90 % of them lie within x, y, z: {box}",
-        *(
-            ["it has an error for each Gaussian: hqgs render --show trust shows them"]
-            if gaussians.errors is not None
-            else []
-        ),
+        *([] if gaussians.errors is None else [errors]),
         *(f"read: {note}" for note in gaussians.notes),
     ]
 

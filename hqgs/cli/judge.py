@@ -50,27 +50,16 @@ def run(options: Judge) -> int:
     if options.out is not None:
         check_out_folder(options.out)
     source, other, known = check_source(options.source, options.photos), None, None
-    from hqgs.evaluation.held_out import looks_beside
-    from hqgs.evaluation.judge import (
-        check_comparable,
-        chosen_views,
-        compared,  # here: they load torch
-        protocol_of,
-        read_judgement,
-    )
+    from hqgs.evaluation.held_out import looks_beside  # here: they load torch
+    from hqgs.evaluation.judge import check_comparable, chosen_views, compared, protocol_of, read_judgement
     from hqgs.evaluation.run_folder import RunFolder
     from hqgs.model.formats.files import scene_file
 
-    run = RunFolder.open(options.source)
-
-    if (
-        options.against is not None
-        and options.against.suffix.lower() == ".json"
-        and options.against.is_file()
-    ):
-        known = read_judgement(options.against)
-    elif options.against is not None:
-        other = scene_file(options.against)
+    run, against = RunFolder.open(options.source), options.against
+    if against is not None and against.suffix.lower() == ".json" and against.is_file():
+        known = read_judgement(against)
+    elif against is not None:
+        other = scene_file(against)
     with LoadingScreen() as screen:
         scene = measured_scene(run, options, screen)
         views = chosen_views(scene, options.views)

@@ -63,9 +63,7 @@ def ready(scene: str) -> None:
     if not is_room(scene) and film_at(scene) is None:
         existing_folder(scene)
     print(f"reading {scene}", flush=True)
-    warnings.filterwarnings(
-        "ignore", category=FutureWarning, message=".*torch.jit"
-    )  # of libraries, not of us
+    warnings.filterwarnings("ignore", category=FutureWarning, message=".*torch.jit")  # of libraries
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, _stop)  # packages that are half loaded take an exception for their own
     import_module("hqgs.pipeline")
@@ -178,8 +176,7 @@ def check_out(out: Path, scene: str, resume: bool, overwrite: bool) -> list[str]
         )
     if out.is_dir() and Path(scene).is_dir() and out.samefile(scene):
         raise ValueError(f"--out {out} is the folder of the photos: name another folder for the run")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"--out {out} is a file: name a folder for the run")
+    check_out_folder(out)
     begun = "a run without checkpoint: it starts again" if is_run(out) else "no run; a new one starts"
     lines = [f"--resume: {out} holds {begun}"] if resume else []
     if others := strangers(out):

@@ -99,9 +99,8 @@ def _best_table(coefficients: Floats) -> tuple[int | None, NDArray[np.int64]]:
     if told.any():
         at = (LOW[0][told], LOW[1][told])
         steps = scores[told].argmax(axis=1) + 1
-        quality = (
-            int(np.abs(np.log(tables[:, at[0], at[1]] / steps)).mean(1).argmin()) + 1
-        )  # nearest by ratio
+        ratios = np.abs(np.log(tables[:, at[0], at[1]] / steps)).mean(1)
+        quality = int(ratios.argmin()) + 1  # nearest by ratio
         free = tables[quality - 1].copy()
         free[at] = steps
         candidates.append((quality, free, _total(scores, free[None])[0] - len(steps) * np.log(STEPS)))

@@ -55,9 +55,7 @@ def pixel_maps(gaussians: Gaussians, camera: Camera, shown: torch.Tensor) -> tup
     column, row = pixels[inside].astype(int).T
     before = torch.zeros(len(gaussians))
     before[torch.from_numpy(inside)] = torch.from_numpy(z[inside]).float() / depths[0, row, column, 0]
-    hangs = torch.from_numpy(inside) & (
-        before < 0.75
-    )  # of the depth in its pixel: such a Gaussian hangs before the surface
+    hangs = torch.from_numpy(inside) & (before < 0.75)  # of its pixel's depth: before the surface
     channels = torch.stack([hangs.float(), shown], 1).to(gaussians.means.dtype)
     found, solid = gaussians.rasterize(camera, channels)[0][0], alphas[0, ..., 0].clamp(min=1e-6)
     return found[..., 0].double().numpy(), (found[..., 1] / solid).double().numpy()

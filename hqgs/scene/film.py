@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import json
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -109,25 +108,15 @@ def frame_details(folder: Path) -> dict[str, float]:
 
     ValueError where its file is damaged.
     """
-    path = folder / FRAMES
-    if not of_film(folder):
-        return {}
     try:
-        details = json.loads(path.read_text(encoding="utf-8"))["details"]
-        return {name: float(detail) for name, detail in details.items()}
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error!r}") from error
+        return {name: float(detail) for name, detail in _written(folder).get("details", {}).items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{folder / FRAMES} is damaged: {error!r}") from error
 
 
 def of_film(folder: Path) -> bool:
-    """Whether a folder says that it holds frames of a film; other programs write a file of this name, too."""
-    try:
-        written = read_json(folder / FRAMES)
-    except OSError:
-        return False
-    except ValueError:
-        return True  # damaged
-    return isinstance(written, dict) and (not written or "details" in written)
+    """Whether a folder says that it holds frames of a film."""
+    return bool(_written(folder))
 
 
 def frames_around(folder: Path) -> bool:
@@ -136,12 +125,13 @@ def frames_around(folder: Path) -> bool:
 
 
 def _written(folder: Path) -> dict[str, Any]:
-    """What `write_details` wrote; nothing where it is not there, or damaged."""
-    try:
-        written = read_json(folder / FRAMES)
-    except (OSError, ValueError):
-        written = None
-    return written if isinstance(written, dict) else {}
+    """What `write_details` wrote; nothing where that is not there: other programs' files have this name, too.
+
+    ValueError where it is damaged.
+    """
+    path = folder / FRAMES
+    written = read_json(path) if path.is_file() else None
+    return written if isinstance(written, dict) and "details" in written else {}
 
 
 def _sharpest(

@@ -98,11 +98,8 @@ def with_turns(photos: list[Photo], notes: list[str]) -> list[Photo]:
         ]
         ratio = float(np.exp(np.mean(np.log(ratios)))) if ratios else 1.0
         shown = ratio > _CLEARER
-        why = (
-            "as edges in the photos show"
-            if max(ratio, 1 / ratio) > _CLEARER
-            else "though that is not certain: check them"
-        )
+        sure = max(ratio, 1 / ratio) > _CLEARER
+        why = "as edges in the photos show" if sure else "though that is not certain: check them"
     notes.append(
         f"{len(turned)} photos are rotated by EXIF: their masks are used as masks of photos "
         f"{'shown upright' if shown else 'as they are stored'}, {why}"

@@ -44,6 +44,4 @@ def with_dropout(gaussians: Gaussians, share: float, seed: int, iteration: int) 
     opacities = opacities.clamp(torch.finfo(opacities.dtype).tiny, OPAQUE)
     kept = log(opacities / (1 - opacities))
     some = torch.where(torch.from_numpy(drawn) < share, DROPPED, kept)
-    return gaussians.like(
-        gaussians.named() | {"opacities": some}
-    )  # as they are to be seen: antialiased or not
+    return gaussians.like(gaussians.named() | {"opacities": some})  # antialiased or not, as they are

@@ -149,9 +149,7 @@ def read_gltf(path: Path) -> Arrays:
                 parts.append(_gaussians(content, buffers, primitive, notes))
                 maps.append(_in_frame(matrix, world))
                 if (left := left - len(parts[-1]["means"])) < 0:
-                    raise ValueError(
-                        f"its nodes show meshes again, more than {MAX_GAUSSIANS:,} Gaussians in all"
-                    )
+                    raise ValueError(f"its nodes show more than {MAX_GAUSSIANS:,} Gaussians, many again")
     if not parts:
         raise ValueError(f"no primitive with {NAME}")
     still = all(np.array_equal(by, np.eye(4)) for by in maps)

@@ -233,11 +233,8 @@ def _check_columns(present: set[str], wanted: list[str]) -> None:
     """ValueError where a column is missing, or the harmonics are of no degree."""
     if missing := [name for name in (*_MEANS, *wanted, *_QUATS) if name not in present]:
         points = {*_MEANS} <= present and not {"opacity", *_SCALES} & present
-        why = (
-            "; it holds only points, from which `hqgs train` makes a scene, with their photos"
-            if points
-            else ""
-        )
+        of_them = "; it holds only points, from which `hqgs train` makes a scene, with their photos"
+        why = of_them if points else ""
         raise ValueError(f"not a 3DGS scene, these properties are missing: {', '.join(missing)}{why}")
     rest = sum(name.startswith("f_rest_") for name in wanted)
     if rest not in [*_REST_COUNTS, _REST_4]:
