@@ -92,7 +92,7 @@ def viewmat_from_pose(pose: NDArray[np.float64], name: str, *, camera_to_world: 
         R = R / size
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > 1e-2 or size < 0:
-        left = ", it mirrors: the camera's or the world's frame is left-handed; negate one of its axes"
+        left = ", it mirrors: the frame of its camera or the world is left-handed; negate one of its axes"
         mirrored = left if size < 0 else ""
         raise ValueError(
             f"photo {name!r}: its pose holds no rotation{mirrored} (R R^T is {error:.3g} off): {R.tolist()}"
