@@ -74,6 +74,7 @@ def run(args: ExportScene) -> int:
     gaussians, run = Gaussians.load(source), RunFolder.open(args.source)
     known = gaussians.along(run.cameras)
     scene = None if args.scene is None else _held_out_photos(run, args)
+    looks = {} if scene is None else looks_beside(source, scene.train)  # that the run measures with
     if args.trust:
         from hqgs.show.trust import trust_of
 
@@ -82,7 +83,6 @@ def run(args: ExportScene) -> int:
     def held_out(shown: Gaussians) -> float | None:
         if scene is None:
             return None
-        looks = looks_beside(source, scene.train)  # that the run measures with
         renders = held_out_renders(scene, shown, background=run.background, looks=looks)
         return held_out_psnr(scene, renders)
 

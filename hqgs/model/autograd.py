@@ -101,12 +101,12 @@ Gradients = tuple[Tensor | None, ...]
 
 
 def first_derivative(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:
-    """A backward pass that is an error to differentiate. Frees `ctx.state`, what Rust keeps, when torch frees
-    tensors, which are all that `save_for_backward` takes."""
+    """A backward pass that is an error to differentiate. Frees `ctx.state`, what is kept for it, when torch
+    frees tensors, which are all that `save_for_backward` takes."""
 
     @wraps(backward)
     def once(ctx: Any, *grads):
-        if getattr(ctx, "state", ctx) is None:
+        if ctx.state is None:
             raise RuntimeError(
                 "Trying to backward through the graph of hqgs.rasterization a second time, when what it kept "
                 "is freed: say backward(retain_graph=True) the first time"

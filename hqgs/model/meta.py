@@ -166,7 +166,7 @@ class _Packed(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, pairs: Pairs, filled: bool, *tensors):
-        ctx.pairs, ctx.shape = pairs, tensors[0].shape
+        ctx.state, ctx.shape = pairs, tensors[0].shape
         ctx.set_materialize_grads(False)
         if filled:
             return torch.from_numpy(pairs.take([as_array(tensor) for tensor in tensors]))
@@ -177,9 +177,9 @@ class _Packed(torch.autograd.Function):
     @first_derivative
     def backward(ctx: Any, *grads):
         if grads[0] is None:
-            return None, None, *[None] * len(ctx.pairs.counts)
+            return None, None, *[None] * len(ctx.state.counts)
         array, found, begin = as_array(grads[0]), [], 0
-        for where in ctx.pairs.where:
+        for where in ctx.state.where:
             dense = np.zeros((ctx.shape[0] * ctx.shape[1], *ctx.shape[2:]), array.dtype)
             dense[where] = array[begin : begin + len(where)]
             begin += len(where)

@@ -85,7 +85,7 @@ def load_views(
             return made(key)
 
     unreadable: dict[str, UnreadableError] = {}
-    shown = any(map(_only_as_shown, photos))
+    shown = any(_only_as_shown(photo) for photo in photos if photo.face is None)
 
     def load(faces: list[Photo]) -> list[View]:
         views, decoded = list[View](), None
