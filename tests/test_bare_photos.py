@@ -327,7 +327,7 @@ def test_photos_are_looked_at_coarsely_where_that_is_enough(photos: list[np.ndar
         given = work_on(photos, folder)
         if not coarse:
             del given["coarse"]
-        found.append(best_attempt(Work(folder, given, 1)))
+        found.append(best_attempt(Work(folder, given)))
     assert [one.one.name for one in found] == ["coarse", "fine"]
     assert [one.registered for one in found] == [len(photos)] * 2
     counts = [sum(one.facts()["features"].values()) for one in found]
@@ -339,7 +339,7 @@ def test_photos_that_coarse_features_do_not_place_are_looked_at_finely(
 ) -> None:
     monkeypatch.setattr(all_passes, "COARSE", 3)  # features, which place nothing
     work_on(photos, tmp_path)
-    program.reconstruct(tmp_path, 2)
+    program.reconstruct(tmp_path)
     told = json.loads((tmp_path / "facts.json").read_text())
     assert told["registered"] == len(photos)
     assert min(told["features"].values()) > 50
@@ -354,7 +354,7 @@ def test_all_photos_are_looked_at_again_only_where_a_few_lost_ones_gain_by_it(
     given = work_on([*photos, foreign], tmp_path)
     if not coarse:
         del given["coarse"]
-    assert best_attempt(Work(tmp_path, given, 1)).registered == len(photos)
+    assert best_attempt(Work(tmp_path, given)).registered == len(photos)
     tried = tmp_path / ("fine.db" if coarse else "smoothed.db")
     with pycolmap.Database.open(tried) as db:
         seen = [db.num_keypoints_for_image(k + 1) > 0 for k in range(len(photos) + 1)]
@@ -388,11 +388,11 @@ def test_where_photos_placed_one_after_the_other_find_no_place_all_are_placed_at
     """And where the matches do not bear that out, they are not."""
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *args, **kwargs: {})
     given = work_on(photos, tmp_path)
-    found = Attempt(Work(tmp_path, given, 1), PASSES[0])
+    found = Attempt(Work(tmp_path, given), PASSES[0])
     found.run()
     assert found.registered == len(photos)
     monkeypatch.setattr(all_passes, "borne_out", lambda *args: 0.7)
-    found = Attempt(Work(tmp_path, given, 1), PASSES[0])
+    found = Attempt(Work(tmp_path, given), PASSES[0])
     found.run()
     assert found.model is None
 
@@ -453,7 +453,7 @@ def test_observations_that_lie_far_off_do_not_turn_the_cameras(
 ) -> None:
     """3 px is near enough to be placed with, and far in photos of this size."""
     given = work_on(photos, tmp_path)
-    one = Attempt(Work(tmp_path, given, 1), FINE)
+    one = Attempt(Work(tmp_path, given), FINE)
     one.run()
     assert one.model is not None
     right = rotations(one.model)

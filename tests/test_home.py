@@ -84,7 +84,7 @@ def attempt(cards: Scene, tmp_path: Path) -> Attempt:
         "Ks": np.stack([camera.K for camera in cameras]),
         "photos": np.array(str(tmp_path / "photos")),
     }
-    ran = Attempt(Work(tmp_path, given, 1), PASSES[1])
+    ran = Attempt(Work(tmp_path, given), PASSES[1])
     ran.run()
     assert ran.registered == 7
     return ran

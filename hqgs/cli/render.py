@@ -146,7 +146,8 @@ def _cameras(
             raise ValueError(f"{source} has no cameras.json, so its views are unknown: use --path orbit")
         held = {kind: [view for view in known.views if view.held_out == kind] for kind in (False, True)}
         chosen = picked(held[False], held[True], views, "the run")
-        return [_file_name(k, v.name) for k, v in enumerate(chosen)], [v.camera for v in chosen], FPS
+        stems = [re.sub(r"[^A-Za-z0-9._-]+", "_", Path(v.name).stem).strip("._")[:80] for v in chosen]
+        return [f"{k:03}_{stem}" for k, stem in enumerate(stems)], [v.camera for v in chosen], FPS
     if path not in PATHS:
         if frames is not None:
             raise ValueError("--frames is for cameras and orbit; a path file has its own frames")
@@ -184,11 +185,6 @@ def _trust(options: Render, gaussians: Gaussians, run: RunFolder) -> Trust:
     elif known is not None:
         print("trust: not calibrated, as the run held out no photo: error bounds are those of other captures")
     return trust
-
-
-def _file_name(number: int, view: str) -> str:
-    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", Path(view).stem).strip("._")[:80]
-    return f"{number:03}_{stem}"
 
 
 def _progress(done: int, total: int) -> None:

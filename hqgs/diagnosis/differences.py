@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.threads import of_each
 from hqgs.diagnosis.blur import (
     LARGEST,
     RING_ERROR,
@@ -55,13 +56,14 @@ def summarised(views: Sequence[View]) -> list[PhotoSummary]:
     known = [tile for tile in tiles if tile is not None]
     # One size for all, so that their frequencies are the same.
     tile = min(known) if len(known) == len(views) > 0 else None
-    found = []
-    for photo, view in zip(photos, views, strict=True):
-        levels = to_levels(photo, f"photo {view.name!r}")
+
+    def summary(number: int) -> PhotoSummary:
+        levels = to_levels(photos[number], f"photo {views[number].name!r}")
         grey = luma(levels)
         spectrum = None if tile is None else rings(power_spectrum(grey, tile))
-        found.append(PhotoSummary(_flat_colour(levels), float(grey.std()), spectrum))
-    return found
+        return PhotoSummary(_flat_colour(levels), float(grey.std()), spectrum)
+
+    return list(of_each(summary, range(len(views))))
 
 
 def _flat_colour(levels: Floats) -> Floats | None:
@@ -122,7 +124,7 @@ def unlike_sharpness(scene: Scene) -> tuple[float, float] | None:
     log_power = np.stack([log_power for _, log_power in rings])
     # [4, N]: of a quarter of the details each, from the coarsest to the finest
     quarters = np.stack([part.mean(1) for part in np.array_split(log_power, 4, axis=1)])
-    directions = np.stack([_directions(view.image) for view in scene.train])
+    directions = np.stack([*of_each(_directions, [view.image for view in scene.train])])
     faces = np.array([view.face for view in scene.train])
     for face in np.unique(faces):
         alike = faces == face

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from hqgs.base.threads import of_each
 from hqgs.diagnosis.blur import LARGEST, LEAST_BLUR, Blur, estimate_blur, extra_sigma
 from hqgs.diagnosis.codec import Hidden, Jpeg, estimate_hidden, film_detail, find_jpeg, quantised
 from hqgs.photos.formula import small_side
@@ -280,11 +281,12 @@ def conclude(photos: Sequence[Inspected]) -> list[PhotoDiagnosis]:
                 quantised(photos[k].levels, steps, c)[:share] for k, c in zip(members, corners, strict=True)
             ]
             hidden = estimate_hidden(np.concatenate(blocks), steps)
-        for k in members:
-            if hiding:
-                diagnoses[k] = _with_hidden(diagnoses[k], hidden)
-            else:
-                diagnoses[k] = _with_blur(diagnoses[k], photos[k].levels, hidden)
+        if hiding:
+            told = [_with_hidden(diagnoses[k], hidden) for k in members]
+        else:
+            told = of_each(lambda k, h=hidden: _with_blur(diagnoses[k], photos[k].levels, h), members)
+        for k, diagnosis in zip(members, told, strict=True):
+            diagnoses[k] = diagnosis
     return diagnoses
 
 

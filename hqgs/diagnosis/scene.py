@@ -14,6 +14,7 @@ from hqgs.base.evenly import evenly
 from hqgs.base.left_out import DIAGNOSIS, LeftOut
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.state import own_state
+from hqgs.base.threads import of_each
 from hqgs.diagnosis.colors import (
     DeviceSigns,
     SharedColors,
@@ -123,14 +124,16 @@ class Inspector:
             raise ValueError(f"max_photos is {max_photos}, wanted at least 1")
         chosen = evenly(len(scene.train), max_photos)
         found: list[Inspected] = []
-        for view in (scene.train[k] for k in chosen):
-            found.append(self.inspect(view))
+        for inspected in of_each(self.inspect, [scene.train[k] for k in chosen]):
+            found.append(inspected)
             self.on_stage(Stage("photos diagnosed", len(found), len(chosen)))
         photos = self._once(lambda: tuple(conclude(found)), "photos", found)
         own = self._once(lambda: self._own(scene, photos), "own", scene.train)
         film = _video(photos)
-        if film.needed:
-            own = *own[:-2], *(_by_codec(part) for part in own[-2:])
+        if film.needed:  # its codec takes more of some frames than of others
+            why = "; strong compression of the film causes that"
+            looks = (replace(p, step=None, reason=p.reason + why) if p.needed else p for p in own[-2:])
+            own = *own[:-2], *looks
         *_, shake, focus = own
         blur = _blur(photos)
         if unlike := [part.name for part in (shake, focus) if part.needed]:
@@ -226,12 +229,6 @@ def _video(photos: Sequence[PhotoDiagnosis]) -> Finding:
     coarse = detail < COARSE_FILM
     reason += "" if coarse else f" (needed below {COARSE_FILM:g})"
     return Finding("video", reason, "video" if coarse else None, detail, spread)
-
-
-def _by_codec(unlike: Finding) -> Finding:
-    """Shake or focus of a coarse film, whose codec takes more of some frames than of others."""
-    reason = f"{unlike.reason}; strong compression of the film causes that"
-    return replace(unlike, step=None, reason=reason) if unlike.needed else unlike
 
 
 def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:

@@ -7,10 +7,8 @@ must. Numbers were chosen on held-back photos.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +18,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from hqgs import _rust
-from hqgs._rust import get_num_threads
 from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.base.threads import of_each
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.geometry import in_frame, project, shrunk, unproject
 from hqgs.scene.scene import Camera, View
@@ -55,8 +53,7 @@ class Agreement:
     def __init__(self, views: Sequence[View], seen: Mapping[str, NDArray[np.intp]]) -> None:
         """`seen`: by the view's name, which points it sees. Views that share most are asked first, but of
         those from one place, as of a burst, one."""
-        with ThreadPoolExecutor(get_num_threads()) as pool:
-            self.looks: list[SmallPhoto] = list(pool.map(SmallPhoto.of, views))
+        self.looks: list[SmallPhoto] = list(of_each(SmallPhoto.of, views))
         rows = [np.unique(seen.get(view.name, np.zeros(0, np.intp))) for view in views]
         ends = np.cumsum([0, *map(len, rows)])
         points = 1 + max((int(some[-1]) for some in rows if len(some)), default=0)
@@ -123,7 +120,6 @@ STAGE = "first points, from photos"
 Points = NDArray[np.float32]
 Colors = NDArray[np.uint8]
 Found = tuple[int, Floats, Floats]  # the number of a view, pixels [M, 2] of it, and their depths [M]
-T = TypeVar("T")
 
 
 def points_along_edges(
@@ -175,7 +171,7 @@ def points_along_edges(
         depths, kept = _borne_out(agreement, surfaces, number, pixels)
         return number, pixels[kept], depths[kept]
 
-    for agreed, one in _of_each(first, len(views)):
+    for agreed, one in of_each(first, range(len(views))):
         agreeing += agreed
         found.append(one)
         on_stage(Stage(STAGE, len(found), looks))
@@ -183,16 +179,10 @@ def points_along_edges(
         for one in found:
             surfaces.add(*one)
         found = list[Found]()
-        for one in _of_each(second, len(views)):
+        for one in of_each(second, range(len(views))):
             found.append(one)
             on_stage(Stage(STAGE, len(views) + len(found), looks))
     return *gathered(views, found), agreeing / max(count, 1)
-
-
-def _of_each(work: Callable[[int], T], count: int) -> Iterable[T]:
-    """What work gives of each view, in their order; several at a time."""
-    with ThreadPoolExecutor(get_num_threads()) as pool:
-        yield from pool.map(work, range(count))
 
 
 def shares(count: int, views: int) -> list[int]:

@@ -7,6 +7,8 @@ mirrors the picture.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
@@ -98,7 +100,7 @@ def area_downscale(
 def _as(image: Pixels, values: NDArray[np.float64]) -> Pixels:
     """The values as the image's type; whole numbers are rounded."""
     if image.dtype == np.uint8:
-        return np.rint(values).clip(0, 255).astype(np.uint8)
+        return np.rint(values).astype(np.uint8)
     return values.astype(np.float32)
 
 
@@ -107,19 +109,28 @@ def _area_sum(
 ) -> NDArray[np.float64]:
     """Sums over the new pixels' areas, [height, width, ...]. Whole numbers stay exact at whole factors."""
     old_height, old_width = image.shape[:2]
-    columns, rows = _overlaps(old_width, width, size[0]), _overlaps(old_height, height, size[1])
+    columns = _overlaps(old_width, width, size[0])
     pixels = image.reshape(old_height, -1)
     out = np.empty((height, width, pixels.shape[1] // old_width))
-    for top in range(0, height, RESIZE_BAND):
-        band = rows[top : top + RESIZE_BAND]
-        first, last = int(band.indices.min()), int(band.indices.max()) + 1
-        tall = band[:, first:last] @ pixels[first:last].astype(np.float64)  # [B, W C]
+    for made, needed, rows in _bands(old_height, height, size[1]):
+        tall = rows @ pixels[needed].astype(np.float64)  # [B, W C]
         turned = tall.reshape(len(tall), old_width, -1).swapaxes(0, 1).reshape(old_width, -1)  # [W, B C]
-        wide = (columns @ turned).reshape(width, len(tall), -1)
-        out[top : top + RESIZE_BAND] = wide.swapaxes(0, 1)
+        out[made] = (columns @ turned).reshape(width, len(tall), -1).swapaxes(0, 1)
     return out.reshape(height, width, *image.shape[2:])
 
 
+@lru_cache(maxsize=8)  # cutting takes longer than using
+def _bands(old: int, new: int, size: float) -> list[tuple[slice, slice, csr_array]]:
+    """`_overlaps` of some new rows at a time: those, the old rows that they need, and what they share."""
+    rows, bands = _overlaps(old, new, size), list[tuple[slice, slice, csr_array]]()
+    for top in range(0, new, RESIZE_BAND):
+        band = rows[top : top + RESIZE_BAND]
+        first, last = int(band.indices.min()), int(band.indices.max()) + 1
+        bands.append((slice(top, top + RESIZE_BAND), slice(first, last), band[:, first:last]))
+    return bands
+
+
+@lru_cache(maxsize=8)
 def _overlaps(old: int, new: int, size: float) -> csr_array:
     """What each of `new` equal parts of 0..size shares with each of `old` pixels, in lengths of these."""
     edges = np.arange(new + 1) * size / new

@@ -10,7 +10,6 @@ import pickle
 import struct
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -24,8 +23,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 from tqdm import tqdm
 
-from hqgs._rust import get_num_threads
-from hqgs.base.threads import one_torch_thread
+from hqgs.base.threads import of_each, one_torch_thread
 from hqgs.photos.pixels import as_floats
 from hqgs.photos.resize import resize
 from hqgs.scene.scene import Scene, View
@@ -85,8 +83,8 @@ def restore_scene(scene: Scene, weights: str | Path, tile: int = 256, overlap: i
                 f"{weights} cannot restore the photo {view.name!r} ({width} x {height} px): {error}"
             ) from error
 
-    with one_torch_thread(), ThreadPoolExecutor(get_num_threads()) as pool:
-        photos = pool.map(restored, scene.train)
+    with one_torch_thread():
+        photos = of_each(restored, scene.train)
         train = list(tqdm(photos, "restore", len(scene.train), unit="photo", disable=None))
     note = (
         f"training photos restored by {network.architecture.name} (scale {network.scale}) from "

@@ -7,10 +7,8 @@ the mean over an area of 2 x 2 and more hides what that loses, and takes a fract
 from __future__ import annotations
 
 import math
-import os
 from collections import defaultdict
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import groupby
@@ -23,6 +21,7 @@ from numpy.typing import NDArray
 
 from hqgs.base.machine import AT_ONCE, give_back_memory, keep_large_arrays_apart
 from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.base.threads import of_each
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
 from hqgs.photos.pixels import oriented
@@ -100,18 +99,13 @@ def load_views(
         return views
 
     groups = [list(faces) for _, faces in groupby(photos, lambda photo: (photo.path, id(photo.camera)))]
-    with ThreadPoolExecutor(min(MAX_WORKERS, os.cpu_count() or 1)) as pool:
-        jobs = [pool.submit(load, faces) for faces in groups]
-        try:
-            views, done = list[View](), 0
-            for k, (faces, job) in enumerate(zip(groups, jobs, strict=True)):
-                views += job.result()
-                done += len(faces)
-                on_stage(Stage("photos read", done, len(photos)))
-                if (k + 1) % 10 == 0 or done == len(photos):
-                    give_back_memory()
-        finally:
-            pool.shutdown(cancel_futures=True)  # after an error the photos still waiting are not wanted
+    views, done = list[View](), 0
+    for k, (faces, loaded) in enumerate(zip(groups, of_each(load, groups, MAX_WORKERS), strict=True)):
+        views += loaded
+        done += len(faces)
+        on_stage(Stage("photos read", done, len(photos)))
+        if (k + 1) % 10 == 0 or done == len(photos):
+            give_back_memory()
     return views, {photo.name: unreadable[photo.name] for photo in photos if photo.name in unreadable}
 
 

@@ -202,14 +202,15 @@ class Trainer:
         return found + left_out_of(self.state.rows)
 
     def held_out(self, numbers: Sequence[int] | None = None) -> HeldOutViews:
-        """The held-out views of these numbers (None: all), for use before the next step."""
-        views = (
-            self.prepared.given.test if numbers is None else [self.prepared.given.test[k] for k in numbers]
-        )
+        """The held-out views of these numbers, for use before the next step; None: all, as reported."""
+        if numbers is None:
+            views, gaussians = self.prepared.given.test, self.model()
+        else:  # in the frame of training: to turn a scene takes longer than to render it
+            views, gaussians = [self.scene.test[k] for k in numbers], self.shown()
         degree = self.schedule.degree(self.iteration)
         learned = {photo.name: photo.look for photo in self.method.learned()}
         looks = looks_of_devices(self.scene.train, learned)
-        return HeldOutViews(views, self.model(), degree, self.config.background, looks)
+        return HeldOutViews(views, gaussians, degree, self.config.background, looks)
 
     def taken(self, number: int) -> NDArray[np.float32]:
         """The training photo of this number, [H, W, 3], as its own camera takes the scene now."""

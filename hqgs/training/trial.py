@@ -145,7 +145,12 @@ def _with_looks(run: ShortRun, kinds: Sequence[str], held: Mapping[int, View], t
     hqgs = replace(run.plan.settings.hqgs, formation="+".join(learned) or NONE)
     run.begin(replace(run.plan, settings=replace(run.plan.settings, hqgs=hqgs)))
     told.steps(run)
-    return np.array([[_of_hidden(run.taken(k), view)] for k, view in held.items()], np.float64)
+    found = list[list[float | None]]()
+    for k, view in held.items():
+        half = np.s_[:, view.camera.width // 2 :]
+        mask = None if view.mask is None else view.mask[half]
+        found.append([psnr_aligned(run.taken(k)[half], view.image[half], mask)])
+    return np.array(found, np.float64)
 
 
 class _Told:
@@ -169,12 +174,6 @@ def _half_shown(view: View) -> View:
     mask = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask.copy()
     mask[:, view.camera.width // 2 :] = False
     return replace(view, mask=mask)
-
-
-def _of_hidden(render: NDArray[np.float32], view: View) -> float | None:
-    """PSNR of the other half, brightness and tint set aside."""
-    half = np.s_[:, view.camera.width // 2 :]
-    return psnr_aligned(render[half], view.image[half], None if view.mask is None else view.mask[half])
 
 
 def _kinds(settings: TrainConfig) -> set[str]:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from hqgs._rust import get_num_threads
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import as_text, some
+from hqgs.base.threads import of_each
 from hqgs.photos import profiles
 from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import Glance, UnreadableError, decode, glance, needs_heic
@@ -135,8 +133,7 @@ class BarePhotos:
             for picture, target in zip(pictures, targets[name], strict=True):
                 picture.save(target, quality=JPEG_QUALITY, subsampling=0)
 
-        with ThreadPoolExecutor(min(MAX_WORKERS, get_num_threads())) as pool:
-            list(pool.map(write, self.names))
+        list(of_each(write, self.names, MAX_WORKERS))
 
 
 def small_copy(path: Path, size: tuple[int, int]) -> Image.Image:
@@ -262,13 +259,12 @@ def _looked_at(photos: BarePhotos, on_stage: OnStage) -> tuple[dict[str, Glance]
         except UnreadableError as error:
             return str(error)
 
-    with ThreadPoolExecutor(min(MAX_WORKERS, os.cpu_count() or 1)) as pool:
-        for k, (name, found) in enumerate(zip(photos.names, pool.map(look, photos.names), strict=True)):
-            if isinstance(found, str):
-                unreadable[as_text(name)] = found
-            else:
-                looked[name] = found
-            on_stage(Stage("photos read", k + 1, len(photos.names)))
+    for k, found in enumerate(of_each(look, photos.names, MAX_WORKERS)):
+        if isinstance(found, str):
+            unreadable[as_text(photos.names[k])] = found
+        else:
+            looked[photos.names[k]] = found
+        on_stage(Stage("photos read", k + 1, len(photos.names)))
     if len(looked) < len(unreadable):
         reasons = some([f"{name} ({why})" for name, why in unreadable.items()])
         raise ValueError(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+
+from hqgs.base.threads import of_each
 
 LOWE_RATIO = pycolmap.FeatureMatchingOptions().sift.max_ratio  # of descriptors' distances (Lowe 2004)
 MATCHED_ALL = 60  # photos; of fewer each is matched with each
@@ -16,9 +17,7 @@ PARTNERS, NEXT = 20, 4  # of a photo: those that are most like it, and those tha
 DESCRIPTOR = 512  # length of COLMAP's descriptors, whole numbers
 
 
-def likely_pairs(
-    db: pycolmap.Database, count: int, most: int = PARTNERS, threads: int = 1
-) -> NDArray[np.int64]:
+def likely_pairs(db: pycolmap.Database, count: int, most: int = PARTNERS) -> NDArray[np.int64]:
     """Pairs [P, 2] of `count` photos, which have the numbers 1 to `count` in `db`, sorted, from 0.
 
     The largest features of each photo are compared with those of each other. A photo is paired with the
@@ -34,8 +33,7 @@ def likely_pairs(
             alike = descriptors[k] @ descriptors[j].T
             scores[k, j] = scores[j, k] = fitting(alike, DESCRIPTOR) + fitting(alike.T, DESCRIPTOR)
 
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(compare, range(count)))
+    list(of_each(compare, range(count)))
     chosen = np.zeros((count, count), bool)
     best = np.argsort(-scores, axis=1, kind="stable")[:, :most]
     np.put_along_axis(chosen, best, np.take_along_axis(scores, best, axis=1) > 0, axis=1)

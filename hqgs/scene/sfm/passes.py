@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,9 @@ import pycolmap
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from hqgs._rust import get_num_threads
 from hqgs.base.evenly import evenly
+from hqgs.base.threads import of_each
 from hqgs.photos.pixels import grey
 from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.sfm.database import (
@@ -65,10 +66,9 @@ PASSES = (Pass("coarse", coarse=True), FINE_PASS, JOINED)  # until ALMOST all ha
 class Work:
     """The photos that are given, and the folder in which COLMAP works."""
 
-    def __init__(self, directory: Path, given: dict[str, Any], threads: int) -> None:
+    def __init__(self, directory: Path, given: dict[str, Any]) -> None:
         self.directory: Path = directory
         self.given: dict[str, Any] = given
-        self.threads: int = threads
         self.names: list[str] = given["names"].tolist()
         self.photos: Path = Path(str(given["photos"]))
         self.faces: int = len(given.get("rotations", [0]))  # of a photo
@@ -125,7 +125,7 @@ class Work:
         extract(self.directory, photos, list(some), self._extraction(one), database)
         pairs = self._pairs(database) if pairs is None else pairs
         self.tell("matches", 0, len(some) * (len(some) - 1) // 2 if pairs is None else len(pairs))
-        match(self.directory, self.names, pairs, self.threads, database)
+        match(self.directory, self.names, pairs, get_num_threads(), database)
         return database
 
     def joined(self, one: Pass) -> Path:
@@ -140,7 +140,7 @@ class Work:
 
     def _extraction(self, one: Pass) -> pycolmap.FeatureExtractionOptions:
         extraction = pycolmap.FeatureExtractionOptions()
-        extraction.num_threads, extraction.max_image_size = self.threads, LARGEST
+        extraction.num_threads, extraction.max_image_size = get_num_threads(), LARGEST
         if self.quick:
             extraction.sift.max_num_features = COARSE if one.coarse else FINE
         if one.coarse:
@@ -153,7 +153,7 @@ class Work:
         if len(self.names) > MATCHED_ALL:
             self.tell("matches", 0)
             with pycolmap.Database.open(database) as db:
-                pairs = likely_pairs(db, len(self.names), PARTNERS, self.threads)
+                pairs = likely_pairs(db, len(self.names), PARTNERS)
         return pairs if self.faces == 1 else pairs_of_faces(len(self.names), self.faces, pairs)
 
     def smoothed(self, sigma: float, names: Sequence[str]) -> Path:
@@ -163,8 +163,7 @@ class Work:
         def copy(name: str) -> None:
             smooth_copy(self.photos / name, out / name, sigma, LARGEST)
 
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(copy, names))
+        list(of_each(copy, names))
         return out
 
     def verify(self, database: Path) -> None:
@@ -174,7 +173,7 @@ class Work:
         # COLMAP's 30,000 took 20 minutes of a corridor, and told the same pairs but for one in 23 that had 18
         # matches.
         geometry.ransac.max_num_trials, geometry.ransac.dyn_num_trials_multiplier = 1000, 1.0
-        verifier.num_threads = self.threads
+        verifier.num_threads = get_num_threads()
         verifier.rig_verification = self.faces > 1  # one geometry for all faces of two photos: floors repeat
         pycolmap.geometric_verification(database, verifier, two_view_geometry_options=geometry)
 

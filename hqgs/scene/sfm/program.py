@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from hqgs._rust import set_num_threads
 from hqgs.scene.sfm.database import LARGEST, extract, known_cameras, match, pipeline_options
 from hqgs.scene.sfm.passes import COARSE, Work, best_attempt
 
@@ -70,13 +71,13 @@ def triangulate(directory: Path) -> None:
     )
 
 
-def reconstruct(directory: Path, threads: int) -> None:
+def reconstruct(directory: Path) -> None:
     """SIFT, matching, RANSAC, incremental mapping; the threads change no bit of the result.
 
     What is found of one photo or pair depends on no other, not even its random numbers, and is read back in
     the order of numbers. Mapping has one thread and the seed 0.
     """
-    best = best_attempt(Work(directory, _given(directory), threads))
+    best = best_attempt(Work(directory, _given(directory)))
     best.refine()
     facts = json.dumps(best.facts())
     (directory / "facts.json").write_text(facts, encoding="utf-8")
@@ -100,12 +101,13 @@ def _end_with_caller() -> None:
 
 def main(command: str, directory: str, threads: str) -> None:
     pycolmap.set_random_seed(0)
+    set_num_threads(int(threads))
     threading.Thread(target=_end_with_caller, daemon=True).start()
     if command == "triangulate":
         pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)
         triangulate(Path(directory))
     else:
-        reconstruct(Path(directory), int(threads))
+        reconstruct(Path(directory))
 
 
 if __name__ == "__main__":

@@ -31,8 +31,6 @@ Adjust = Callable[[pycolmap.Reconstruction, float, bool], None]
 class Adjusting(Protocol):
     """How models are adjusted: what COLMAP's options of a pass are needed for."""
 
-    threads: int
-
     def adjust(self, model: pycolmap.Reconstruction, scale: float, move: bool) -> None: ...
     def settle(self, model: pycolmap.Reconstruction) -> None: ...
     def tell(self, stage: str, done: int, total: int = 0) -> None: ...
@@ -53,7 +51,7 @@ def refined(
     model, all_sure = plain, sure >= placed_names(plain)
     for _ in range(1 if all_sure else 2):  # weaker evidence: farther off
         rounds = ROUNDS if unsure else FEWER
-        model = sharpened(model, folder, work.adjust, rounds, work.threads)
+        model = sharpened(model, folder, work.adjust, rounds)
     if model is plain and not all_sure:
         work.settle(plain)
     whole = model.num_reg_images() == photos >= ALWAYS_CHECKED
@@ -62,7 +60,7 @@ def refined(
     work.tell("agree", 0)
     rest = rebuilt(model, *read_tracks(plain))
     work.adjust(rest, usual(plain), False)
-    agree = agreement(rest, folder, work.threads)
+    agree = agreement(rest, folder)
     strange = {name for name, counts in agree.items() if not confirmed(*counts)} - sure
     if strange:
         without(model, strange)
@@ -83,7 +81,7 @@ def without(model: pycolmap.Reconstruction, names: set[str]) -> None:
 
 
 def sharpened(
-    model: pycolmap.Reconstruction, folder: Path, adjust: Adjust, rounds: int = ROUNDS, threads: int = 1
+    model: pycolmap.Reconstruction, folder: Path, adjust: Adjust, rounds: int = ROUNDS
 ) -> pycolmap.Reconstruction:
     """The model after `rounds` of patches and adjustment; as it is where the patches do not fit.
 
@@ -93,7 +91,7 @@ def sharpened(
     The points that most photos see, LAID in each photo, make the poses precise; the others follow them.
     """
     names, tracks = read_tracks(model)
-    photos = dict(zip(names, read_photos(folder, names, threads), strict=True))
+    photos = dict(zip(names, read_photos(folder, names), strict=True))
     before = usual(model)
     sides = [max(camera.width, camera.height) for camera in model.cameras.values()]
     # points nearer than 2 px are the same
@@ -104,7 +102,7 @@ def sharpened(
         new = np.zeros(len(some.view), bool)
         if number > 0:
             some, new = widened(views, some)
-        some, sure, unlike = aligned(views, some, new, threads)
+        some, sure, unlike = aligned(views, some, new)
         if 2 * unlike.sum() > len(names):
             return model
         now = rebuilt(now, names, some.chosen(sure))

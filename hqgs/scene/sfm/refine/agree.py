@@ -31,7 +31,7 @@ BESIDE = 4 * REACH  # px of the photos that are looked at: there no patch reache
 Agreement = dict[str, tuple[int, int, int]]  # of a photo: points looked for, that agree, that agree beside
 
 
-def agreement(model: pycolmap.Reconstruction, folder: Path, threads: int = 1) -> Agreement:
+def agreement(model: pycolmap.Reconstruction, folder: Path) -> Agreement:
     """Of each photo with a place, how many points that it should show it shows; photos are in `folder`."""
     names, tracks = read_tracks(model)
     length = np.bincount(tracks.point, minlength=len(tracks.points))
@@ -39,7 +39,7 @@ def agreement(model: pycolmap.Reconstruction, folder: Path, threads: int = 1) ->
     for k in range(len(names)):
         mine = tracks.point[tracks.view == k]
         longest[mine[np.argsort(-length[mine], kind="stable")[:SEARCHED]]] = True
-    photos = read_photos(folder, names, threads)
+    photos = read_photos(folder, names)
     views = [PatchView(model, name, photo) for name, photo in zip(names, photos, strict=True)]
     chosen = tracks.chosen(longest[tracks.point])
     should = chosen.xy.copy()
@@ -61,7 +61,7 @@ def agreement(model: pycolmap.Reconstruction, folder: Path, threads: int = 1) ->
     shift = np.zeros(some.xy.shape)
     towards = np.where(some.xy[rows, axis] < sizes[rows, axis] / 2, BESIDE, -BESIDE)  # stays in the photo
     shift[rows, axis] = np.where(new, towards / ratios[rows, axis], 0)
-    at, beside = (fitted(views, replace(some, xy=xy), new, threads)[1] for xy in (some.xy, some.xy + shift))
+    at, beside = (fitted(views, replace(some, xy=xy), new)[1] for xy in (some.xy, some.xy + shift))
     all_of_it, others = (
         np.array([np.bincount(some.view[rows & that], minlength=len(names)) for that in (new, at, beside)])
         for rows in (new, foreign)

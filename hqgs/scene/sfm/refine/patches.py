@@ -15,7 +15,9 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.sparse import csr_array
 
+from hqgs._rust import get_num_threads
 from hqgs.base.machine import AT_ONCE
+from hqgs.base.threads import of_each
 from hqgs.photos.pixels import grey
 from hqgs.scene.sfm.refine.tracks import Floats, Tracks, seen_at
 
@@ -30,7 +32,7 @@ FRONTAL = 0.8  # cosine of the angle between a patch's normal and a new ray, lea
 COARSER = 2.0  # px of a photo in which a point is looked for, in px of the finest that shows it, most
 
 
-def read_photos(folder: Path, names: Sequence[str], threads: int) -> list[NDArray[np.float32]]:
+def read_photos(folder: Path, names: Sequence[str]) -> list[NDArray[np.float32]]:
     """Photos of a folder, gray and smoothed, their longest side at most PATCH_SIDE px."""
 
     def read(name: str) -> NDArray[np.float32]:
@@ -43,8 +45,7 @@ def read_photos(folder: Path, names: Sequence[str], threads: int) -> list[NDArra
             values = np.asarray(gray, np.float32)
         return np.asarray(gaussian_filter(values, 1.0, mode="nearest"), np.float32)
 
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(read, names))
+    return list(of_each(read, names))
 
 
 class PatchView:
@@ -154,7 +155,7 @@ def _slopes(patches: NDArray[np.float32], mean: NDArray[np.float32]) -> Floats:
 
 
 def fitted(
-    views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_], threads: int = 1
+    views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_]
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Where the patches of observations agree best with those of their points' other photos [O, 2], and which
     of them are sure [O]. New ones do not count in the means.
@@ -164,7 +165,7 @@ def fitted(
     at, counted = tracks.xy, usable & ~new
     reach = REACH / np.array([view.ratio[0] for view in views])[tracks.view, None]
     parts = [slice(start, start + 4096) for start in range(0, max(1, len(at)), 4096)]
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(get_num_threads()) as pool:
         for _ in range(PATCH_STEPS):
             patches = _patches(views, tracks, turns, at, pool)
             mean = _means(patches, tracks, counted)
@@ -183,14 +184,14 @@ def fitted(
 
 
 def aligned(
-    views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_], threads: int = 1
+    views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_]
 ) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]:
     """Observations moved to where they are `fitted`, which of them are sure [O], and which photos look unlike
     the others [V].
 
     A photo of which few are sure is unlike: its own stay where features had them.
     """
-    at, sure = fitted(views, tracks, new, threads)
+    at, sure = fitted(views, tracks, new)
     known = np.bincount(tracks.view[~new], minlength=len(views))
     unlike = np.bincount(tracks.view[~new & sure], minlength=len(views)) < UNLIKE * known
     stay = unlike[tracks.view]
