@@ -22,7 +22,7 @@ from hqgs.diagnosis.blur import (
 from hqgs.diagnosis.photo import Finding
 from hqgs.photos.jpeg import blocks_of
 from hqgs.photos.pixels import Floats, as_floats, luma, to_levels
-from hqgs.scene.constants import FEWEST_PHOTOS
+from hqgs.scene.constants import FEWEST_PHOTOS, MAX_WORKERS
 from hqgs.scene.scene import Scene, View
 
 CHOICE_SIGMAS = np.arange(-3, 10.01, 0.25)  # px; below 0: sharper than the others
@@ -63,7 +63,7 @@ def summarised(views: Sequence[View]) -> list[PhotoSummary]:
         spectrum = None if tile is None else rings(power_spectrum(grey, tile))
         return PhotoSummary(_flat_colour(levels), float(grey.std()), spectrum)
 
-    return list(of_each(summary, range(len(views))))
+    return list(of_each(summary, range(len(views)), MAX_WORKERS))
 
 
 def _flat_colour(levels: Floats) -> Floats | None:

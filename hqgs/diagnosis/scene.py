@@ -28,6 +28,7 @@ from hqgs.diagnosis.differences import shake_finding
 from hqgs.diagnosis.focus import MOST_PHOTOS, focus_finding
 from hqgs.diagnosis.photo import Finding, Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.photos.formula import DEVICES, KINDS, NONE, parse_formation, within
+from hqgs.scene.constants import MAX_WORKERS
 from hqgs.scene.scene import Scene, View
 
 SCENE_WHITE = 0.2  # up to this correlation of neighbours, noise counts as white
@@ -124,7 +125,7 @@ class Inspector:
             raise ValueError(f"max_photos is {max_photos}, wanted at least 1")
         chosen = evenly(len(scene.train), max_photos)
         found: list[Inspected] = []
-        for inspected in of_each(self.inspect, [scene.train[k] for k in chosen]):
+        for inspected in of_each(self.inspect, [scene.train[k] for k in chosen], MAX_WORKERS):
             found.append(inspected)
             self.on_stage(Stage("photos diagnosed", len(found), len(chosen)))
         photos = self._once(lambda: tuple(conclude(found)), "photos", found)

@@ -25,7 +25,6 @@ def likely_pairs(db: pycolmap.Database, count: int, most: int = PARTNERS) -> NDA
     The numbers are whole and below 2^24, so that no order of sums and no number of threads changes a pair.
     """
     descriptors = [_largest(db, k + 1) for k in range(count)]
-
     scores = np.zeros((count, count), np.int64)
 
     def compare(k: int) -> None:
