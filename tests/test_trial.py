@@ -44,7 +44,14 @@ def told(plan: RunPlan) -> str:
 
 @pytest.mark.parametrize(
     ("gain", "sure", "grows"),
-    [(-1.98, -5.0, True), (0.99, 2.5, False), (0.5, 1.2, False), (0.3, 0.8, True), (0.02, 2.0, True)],
+    [
+        (-1.98, -5.0, True),
+        (0.99, 2.5, False),
+        (0.5, 1.2, False),
+        (0.3, 0.8, False),
+        (0.1, -0.1, True),
+        (0.02, 2.0, False),
+    ],
 )
 def test_nothing_grows_where_photos_held_back_are_better_for_it(
     gain: float, sure: float, grows: bool

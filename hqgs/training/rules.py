@@ -370,7 +370,7 @@ def growth(draft: Draft) -> None:
         told = f"without it {tried}; mean gain of PSNR, SSIM and HaarPSI: {tried.sure:.1f} standard errors"
     dense = draft.undegraded and draft.dense
     left, why = None, "the schedule of 3DGS, scaled to the length of the run"
-    if dense and tried is not None and tried.pays:
+    if dense and tried is not None and tried.sure > 0:  # growth, which takes time, must improve them
         draft.grow(**no_growth(draft.settings))
         why = "in short test runs added Gaussians overfitted the photos: validation photos became worse"
         draft.note("none", why, told, "densification")
